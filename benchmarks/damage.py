@@ -204,7 +204,7 @@ class Trials:
                 return "refused"
             code, text = call(self.inputs, self.words(out, "--overwrite"))
             # those two have the words of the command
-            said = self.compare(out, code, text, ignored=("report.html", "results.json"))
+            said = self.compare(out, code, text, ignored=("report.html", "manifest.json"))
             return f"refused, {said} with --overwrite"
         return self.compare(out, code, text)
 

@@ -93,7 +93,7 @@ def main() -> None:
             count = make(folder, rows)
             size = sum(part.stat().st_size for part in (folder / "points").iterdir()) / 1e6
             seconds, memory = measure(folder)
-            parts = json.loads((folder / "results.json").read_text())["results"]["sweep"]["parts"]
+            parts = json.loads((folder / "manifest.json").read_text())["results"]["sweep"]["parts"]
         print(f"{count:>10} runs  {parts:>5} parts  {size:7.0f} MB  {seconds:6.1f} s  {memory:6.0f} MB", flush=True)
 
 

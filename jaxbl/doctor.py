@@ -20,10 +20,10 @@ from .workers import PROGRAMS_VARIABLE, announce, count_cores, count_memory
 
 
 class Finding(NamedTuple):
-    """A line of the report: name of the check, its result, True if that is in order. If not, `found` says what to do."""
+    """A line of the report: name of the check, its result, True if that is in order. If not, `outcome` says what to do."""
 
     name: str
-    found: str
+    outcome: str
     good: bool = True
 
 

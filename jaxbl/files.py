@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from .errors import InputError, NoResult
 from .json_types import JsonObject
 
-MANIFEST = "results.json"
+MANIFEST = "manifest.json"
 FORMAT = 5
 """Format of the manifest; it is raised when older versions cannot read a new one."""
 
@@ -430,7 +430,7 @@ def log_subject(log: Path) -> Subject:
 
 
 class ResultFolder:
-    """A folder of results with its manifest, `results.json`.
+    """A folder of results with its manifest, `manifest.json`.
 
     Attributes:
         path: the folder.
@@ -546,12 +546,12 @@ def claim_folder(
         results = ResultFolder.read(folder) or recover(folder)
         if results is None and not is_empty(folder):
             raise InputError(
-                f"{folder}: is not empty and holds no results with a {MANIFEST} (an earlier jaxbl wrote none); choose "
+                f"{folder}: is not empty and holds no results with a {MANIFEST} (an earlier jaxbl wrote none there); choose "
                 "another folder with --out, where they are made anew"
             )
-    except InputError:
+    except InputError as error:
         results = recover(folder)
-        if results is None and not (overwrite and (folder / MANIFEST).exists()):
+        if results is None and not (overwrite and "damaged" in str(error)):
             raise
     if results is None:
         remove(folder / MANIFEST)

@@ -99,15 +99,15 @@ def _record_signals(state: Any, signals: Signals) -> Signals:
 
 
 @eqx.filter_jit
-def simulate(experiment: Experiment, seed: Any = 0, *, every: int = 1) -> Signals:
+def simulate(experiment: Experiment, seed: Any = 0, *, stride: int = 1) -> Signals:
     """Simulate the experiment with its own input, and return all signals, with a leading time axis.
 
     Args:
         experiment: of :func:`experiment`.
         seed: of the encoder noise.
-        every: keep one of so many samples.
+        stride: keep one of so many samples.
     """
-    return scan(experiment, seed, record=_record_signals, stride=every)[1]
+    return scan(experiment, seed, record=_record_signals, stride=stride)[1]
 
 
 @eqx.filter_jit
@@ -135,12 +135,12 @@ def metrics(experiment: Experiment, seed: Any = 0, *, names: tuple[str, ...] | N
         InputError: there is no such metric.
     """
     columns = metric_columns(experiment, names)
-    found, _ = scan(experiment, seed, (metrics_reducer(names),))
+    results, _ = scan(experiment, seed, (metrics_reducer(names),))
     if needs_gain_metrics(names):
         for side, gains in observer_gains(experiment).items():
-            judged = compute_gain_metrics(*map(jnp.asarray, gains), found[f"{side}.f_plus"])
-            found |= {f"{side}.{name}": value for name, value in judged.items()}
-    return {name: found[name] for name in columns}
+            judged = compute_gain_metrics(*map(jnp.asarray, gains), results[f"{side}.f_plus"])
+            results |= {f"{side}.{name}": value for name, value in judged.items()}
+    return {name: results[name] for name in columns}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -220,9 +220,9 @@ def sweep_arrays(
         parts = []
         for start in range(0, count, points):
             indices = np.minimum(np.arange(start, start + points), count - 1)
-            found, gains = program.run({path: column[indices] for path, column in lanes.items()}, seed_values)
-            found = add_gain_metrics(found, gains) if needs_gain_metrics(names) else found
-            parts.append({name: np.asarray(found[name])[:, : count - start] for name in columns})
+            results, gains = program.run({path: column[indices] for path, column in lanes.items()}, seed_values)
+            results = add_gain_metrics(results, gains) if needs_gain_metrics(names) else results
+            parts.append({name: np.asarray(results[name])[:, : count - start] for name in columns})
     return Grid(
         {**axes, "seed": seed_values},
         {name: np.concatenate([part[name] for part in parts], 1).T.reshape(*shape, seeds) for name in columns},

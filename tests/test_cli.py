@@ -44,7 +44,7 @@ AXES = [listed_axis(ALPHA, 5.0, 9.0, 20.0)]
 GAINS = [listed_axis(ALPHA, 5.0, 9.0), listed_axis(LAMBDA, 3.0, 6.0)]
 
 NO_RESULTS = (
-    "{}: is not empty and holds no results with a results.json (an earlier jaxbl wrote none); choose another folder with "
+    "{}: is not empty and holds no results with a manifest.json (an earlier jaxbl wrote none); choose another folder with "
     "--out, where they are made anew"
 )
 
@@ -103,7 +103,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
     folder = tmp_path / "results" / "study_map"
     assert list_files(folder) == [
-        "figures/line_motor_velocity_rmse.png", "points/part-00000.parquet", "report.html", "results.json", "study.toml",
+        "figures/line_motor_velocity_rmse.png", "points/part-00000.parquet", "report.html", "manifest.json", "study.toml",
     ]  # fmt: skip
     lines = first.stdout.splitlines()
     assert lines[0].startswith("✓ Good: 6 runs: the motor observer converges in ")
@@ -132,7 +132,7 @@ def test_interrupted_sweep_says_how_to_go_on(tmp_path):
         == "interrupted; what is finished is kept. Go on with: jaxbl sweep 'a study.toml' --out out\n"
     )
     assert 1 <= len(list(folder.glob("points/part-*.parquet"))) < 30
-    assert not json.loads((folder / "results.json").read_text())["results"]["sweep"]["finished"]
+    assert not json.loads((folder / "manifest.json").read_text())["results"]["sweep"]["finished"]
 
 
 def test_interrupt_anywhere_else():
@@ -262,10 +262,10 @@ BAD = {
     ),
     "nothing of which to say the status": (
         ["status", "full"],
-        "full: holds no study (no results.json of a sweep); run 'jaxbl sweep' first",
+        "full: holds no study (no manifest.json of a sweep); run 'jaxbl sweep' first",
     ),
-    "nothing to plot": (["plot", "full"], "full: holds no study (no results.json of a sweep); run 'jaxbl sweep' first"),
-    "nowhere to plot": (["plot", "none"], "none: holds no study (no results.json of a sweep); run 'jaxbl sweep' first"),
+    "nothing to plot": (["plot", "full"], "full: holds no study (no manifest.json of a sweep); run 'jaxbl sweep' first"),
+    "nowhere to plot": (["plot", "none"], "none: holds no study (no manifest.json of a sweep); run 'jaxbl sweep' first"),
 }
 
 
@@ -485,7 +485,7 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     folder = tmp_path / "results" / "study_gains"
     assert code == 0
     figures = {f"figures/{name}.png" for name in ("tuning_motor", "pareto_motor", "tuning_holdout")}
-    assert {"gains.toml", "tuning.json", "report.html", "results.json"} | figures <= set(list_files(folder))
+    assert {"gains.toml", "tuning.json", "report.html", "manifest.json"} | figures <= set(list_files(folder))
     assert "λ = " in lines[0] and "α = " in lines[0] and len(lines) <= 8
     assert re.search(r"Compiled in [\d.]+ s, ran 26 lanes in [\d.]+ s\.", (folder / "report.html").read_text())
     assert lines[-1] == "results/study_gains/report.html"
@@ -539,7 +539,7 @@ def test_results_of_another_study_stay_until_overwriting_is_asked_for(call, tmp_
         with pytest.raises(InputError, match=r"out: holds results of another study \(small\)"):
             call(command, "b.toml", "--out", "out")
     call("sweep", "b.toml", "--out", "out", "--overwrite")
-    assert json.loads((tmp_path / "out" / "results.json").read_text())["results"]["sweep"]["title"] == "second"
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["results"]["sweep"]["title"] == "second"
 
 
 def test_progress_on_a_terminal_is_a_line_that_is_taken_away(monkeypatch, capsys):

@@ -21,7 +21,7 @@ def test_it_names_versions_devices_and_folders_and_tests_itself(doctor_findings,
     # tests keep no programs
     assert [finding.name for finding in doctor_findings if not finding.good] == ["cache"]
     assert code == 1 and lines[-1] == "Not in order: cache."
-    assert "jax " in finding_by_name["packages"].found and all(len(line) <= 80 or "/" in line for line in lines)
+    assert "jax " in finding_by_name["packages"].outcome and all(len(line) <= 80 or "/" in line for line in lines)
     code, lines, _ = call("doctor", "--json")
     data = json.loads("\n".join(lines))
     assert data["exit"] == 1 and len(data["summary"]["findings"]) == len(doctor_findings)
@@ -33,5 +33,5 @@ def test_a_wrong_answer_is_found(monkeypatch):
     monkeypatch.setattr(doctor, "run", lambda study: trial._replace(trace=trace))
     monkeypatch.setattr(doctor, "_test_two_backends", lambda: (0.0, "equal"))
     *_, finding, other, _ = doctor.examine()
-    assert not finding.good and finding.found.endswith("too far; report it with these lines")
+    assert not finding.good and finding.outcome.endswith("too far; report it with these lines")
     assert other == ("two backends", "equal", True)

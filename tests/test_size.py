@@ -8,22 +8,23 @@ import size
 from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
-# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why.
+# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why: 395 948 is 393 921 and
+# the engine as functions, for which (and for the loop closed) a sum of 10 000 more is named.
 CEILINGS = {
-    "all": (393921, 0.04, 0.27, 0.0),
-    "report": (60535, 0.2, 1.17, 0.0),
+    "all": (395948, 0.04, 0.27, 0.0),
+    "report": (62166, 0.2, 1.17, 0.0),
     "diagnosis": (59529, 0.0, 0.0, 0.0),
-    "records": (48437, 0.0, 0.0, 0.0),
-    "gains": (39308, 0.0, 0.0, 0.0),
+    "records": (49404, 0.0, 0.0, 0.0),
+    "gains": (36899, 0.0, 0.0, 0.0),
     "estimation": (34386, 0.0, 0.0, 0.0),
-    "sweeps": (28654, 0.07, 0.0, 0.0),
-    "exports": (22786, 0.02, 0.0, 0.0),
-    "fused": (24223, 0.0, 0.0, 0.0),
-    ".": (18345, 0.02, 0.0, 0.0),
-    "drive": (12680, 0.0, 1.67, 0.0),
-    "throughput": (11727, 0.0, 0.0, 0.0),
-    "cli": (9490, 0.09, 0.0, 0.0),
-    "config": (9331, 0.0, 0.0, 0.0),
+    "sweeps": (28428, 0.07, 0.0, 0.0),
+    "exports": (22708, 0.02, 0.0, 0.0),
+    "fused": (24243, 0.0, 0.0, 0.0),
+    ".": (21345, 0.02, 0.0, 0.0),
+    "drive": (12893, 0.0, 1.67, 0.0),
+    "throughput": (10661, 0.0, 0.0, 0.0),
+    "cli": (9462, 0.09, 0.0, 0.0),
+    "config": (9334, 0.0, 0.0, 0.0),
     "observer": (8962, 0.0, 0.0, 0.0),
     "monitoring": (5528, 0.0, 0.0, 0.0),
 }

@@ -186,7 +186,7 @@ def doctor(context: typer.Context) -> Outcome:
         findings = examine()
     failures = [finding.name for finding in findings if not finding.good]
     lines = format_descriptions(
-        (finding.name, finding.found if finding.good else f"FAILED: {finding.found}") for finding in findings
+        (finding.name, finding.outcome if finding.good else f"FAILED: {finding.outcome}") for finding in findings
     )
     lines.append(f"Not in order: {', '.join(failures)}." if failures else "All in order.")
     return Outcome(lines, summary={"findings": [finding._asdict() for finding in findings]}, code=1 if failures else 0)

@@ -37,7 +37,6 @@ from .error_system import (
     simulate_error_system,
 )
 from .marks import judge_marks
-from .rules import judge_rules
 from .stages import Stages, open_stages
 
 _MOST_LISTED = 200
@@ -136,7 +135,6 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 {"damping": damping, "alpha_ratio": error_map.alpha, "least_lambda_ratio": boundary}
                 for damping, boundary in error_map.boundary_by_damping.items()
             ],
-            "rules": judge_rules(error_map.alpha, error_map.lambda_, error_map.ratio),
             "marks": judge_marks(config, studies["drive"], stages),
             "counterexamples": at_true_bound.head(_MOST_LISTED).to_dict("records"),
             "counterexamples_in_all": len(at_true_bound),

@@ -520,8 +520,8 @@ def _find_separator(rows: Sequence[str]) -> str:
     """Return the separator between cells: one that makes about as many of most rows as of the first one."""
     candidates = [c for c in ";\t," if c in rows[0]]
     for separator in candidates:
-        first, *others = (len(_split_cells(row, separator)) for row in rows)
-        if 2 * sum(first <= count <= first + 1 for count in others) >= len(others):
+        first, *counts = (len(_split_cells(row, separator)) for row in rows)
+        if 2 * sum(first <= count <= first + 1 for count in counts) >= len(counts):
             return separator
     return candidates[0] if candidates else _WHITE_SPACE
 
@@ -620,8 +620,8 @@ def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) 
 
 def _note_units(columns: Columns, units: Sequence[str]) -> None:
     """Keep the units that a file gives for its columns, with a remark."""
-    given = {name: unit.strip("[]()") for name, unit in zip(columns, units, strict=False)}
-    columns.units |= {name: unit for name, unit in given.items() if unit}
+    pairs = zip(columns, (unit.strip("[]()") for unit in units), strict=False)
+    columns.units |= {name: unit for name, unit in pairs if unit}
     if columns.units:
         units_text = ", ".join(f"{name} {unit}" for name, unit in columns.units.items())
         columns.notes.append(f"The file gives these units, which [log] should repeat: {units_text}.")

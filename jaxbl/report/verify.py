@@ -21,7 +21,6 @@ from .error_plane import draw_worst_planes
 from .gain_plane import EXACT, condition_curves, usual_rule_curve
 from .maps import cell_edges
 from .panels import BLUE, COLOURS, MARKERS, VERMILION, Axis, Figure, Line, Map, Panel, Part, Scale, cloud, literal, mark
-from .tuning_rules import draw_rules, rule_lines, rule_table
 
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
@@ -33,7 +32,7 @@ def draw_verdict(verdict: Verdict) -> list[Figure]:
     summary, plane = verdict.summary, verdict.error_map
     damping = [_damping(verdict)] if plane.boundary_by_damping else []
     levels = [_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)]
-    return [_atlas(verdict), draw_rules(summary["rules"]), *draw_worst_planes(summary["marks"]), *damping, *levels]
+    return [_atlas(verdict), *draw_worst_planes(summary["marks"]), *damping, *levels]
 
 
 def _mark_gains(verdict: Verdict) -> list[Line]:
@@ -131,7 +130,7 @@ def write_verdict(verdict: Verdict, folder: Path) -> str:
 
 def describe_verdict(verdict: Verdict) -> Result:
     """Say whether the marked gains are safe, and which conditions are wrong."""
-    marks, rules, levels = (verdict.summary[key] for key in ("marks", "rules", "levels"))
+    marks, levels = verdict.summary["marks"], verdict.summary["levels"]
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
     failures = sum(entry["counterexamples"] for level in levels for entry in level["conditions"] if entry["name"] == "exact")
     extent = (
@@ -154,12 +153,11 @@ def describe_verdict(verdict: Verdict) -> Result:
     ]
     tables = [_level_table(level) for level in levels]
     tables += [table for level in levels for table in _claimed_tables(level)]
-    tables.append(rule_table(rules))
     if marks:
         tables[:0] = [_mark_table(marks), *_disturbance_tables(marks)]
     if len(verdict.counterexamples):
         tables.append(_counterexample_table(verdict))
-    remarks = [*map(_mark_line, marks), *_level_lines(verdict), *rule_lines(rules)]
+    remarks = [*map(_mark_line, marks), *_level_lines(verdict)]
     title = verdict.config.title or "Gain conditions"
     return Result(title, word, headline, figures, remarks, verdict.config.notes, tables)
 

@@ -59,12 +59,12 @@ def rank_axes(result: StudyResult, error: str) -> list[AxisImportance]:
     if sweep.design == "saltelli" and len(points) == sweep.points:  # its estimators need all of it
         from SALib.analyze import sobol
 
-        found = sobol.analyze(problem, outcomes, calc_second_order=False, seed=0)
+        indices = sobol.analyze(problem, outcomes, calc_second_order=False, seed=0)
     else:
         from SALib.analyze import rbd_fast
 
-        found = rbd_fast.analyze(problem, inputs, outcomes, seed=0)
-    ranked = [AxisImportance(path, _pair(found, "S1", i), _pair(found, "ST", i)) for i, path in enumerate(paths)]
+        indices = rbd_fast.analyze(problem, inputs, outcomes, seed=0)
+    ranked = [AxisImportance(path, _pair(indices, "S1", i), _pair(indices, "ST", i)) for i, path in enumerate(paths)]
     return sorted(ranked, key=lambda axis: -(axis.total or axis.alone)[0])
 
 
@@ -83,5 +83,5 @@ def _read_points(result: StudyResult, paths: list[str], error: str) -> pd.DataFr
     return rows.groupby(paths, sort=False)[error].mean().reset_index()
 
 
-def _pair(found: Mapping[str, Any], key: str, i: int) -> Any:
-    return (float(found[key][i]), float(found[f"{key}_conf"][i])) if key in found else None
+def _pair(indices: Mapping[str, Any], key: str, i: int) -> Any:
+    return (float(indices[key][i]), float(indices[f"{key}_conf"][i])) if key in indices else None

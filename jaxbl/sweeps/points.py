@@ -285,8 +285,8 @@ def draw_sobol(dimensions: int, count: int, seed: int) -> np.ndarray:
 
 def _draw_saltelli(dimensions: int, count: int, seed: int) -> np.ndarray:
     """Draw Saltelli's design, `(count, dimensions)`: two samples of Sobol's sequence, and their mixtures."""
-    samples, rest = divmod(count, dimensions + 2)
-    if rest or samples & (samples - 1) or samples < 2:
+    samples, remainder = divmod(count, dimensions + 2)
+    if remainder or samples & (samples - 1) or samples < 2:
         fitting = (dimensions + 2) * 2 ** max(round(math.log2(max(count / (dimensions + 2), 1))), 1)
         raise InputError(
             f"sweep.points: {count} make no Saltelli design of {dimensions} axes, which has {dimensions + 2} times a power "

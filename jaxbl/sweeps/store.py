@@ -27,7 +27,6 @@ from jaxbl.files import (
     Subject,
     checksum,
     claim_folder,
-    has_file,
     is_remote,
     list_paths,
     move_file,
@@ -197,11 +196,6 @@ class Store:
             return cls(results)
         if _recover_study(folder) is not None:
             raise InputError(f"{folder}: {lost} {MANIFEST}; 'jaxbl repair {folder}' writes it anew from the parts")
-        if has_file(folder, "manifest.json"):
-            raise InputError(
-                f"{folder}: was written by an earlier jaxbl; read it with that, or 'jaxbl sweep {folder / STUDY} --out NEW' "
-                "makes it anew"
-            )
         raise InputError(f"{folder}: holds no study (no {MANIFEST} of a sweep); run 'jaxbl sweep' first")
 
     @property

@@ -253,7 +253,7 @@ def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path,
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "figures",
         "report.html",
-        "results.json",
+        "manifest.json",
         "watch.csv",
         "watch.json",
     ]

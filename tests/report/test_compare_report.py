@@ -85,7 +85,7 @@ def test_unfinished_studies_are_compared_as_far_as_they_are(studies_folder, tmp_
 @pytest.mark.parametrize(
     ("second", "out", "message"),
     [
-        ("nothing", "new", "nothing: holds no study (no results.json of a sweep); run 'jaxbl sweep' first"),
+        ("nothing", "new", "nothing: holds no study (no manifest.json of a sweep); run 'jaxbl sweep' first"),
         ("after", "before", "before: holds results of a study (before); choose another folder with --out"),
     ],
 )

@@ -126,7 +126,7 @@ def test_page_of_a_run_and_its_files(tmp_path):
     lines = write_report(trial, tmp_path).sentences
     assert "stiffness: undetermined (motor), undetermined (load); true 1" in lines
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        *("figures", "report.html", "results.json", "summary.json", "trace.parquet")
+        *("figures", "report.html", "manifest.json", "summary.json", "trace.parquet")
     ]
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), trial.trace)

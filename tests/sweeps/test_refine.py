@@ -530,7 +530,7 @@ def read_files(folder):
 
 
 def read_manifest(folder):
-    return json.loads((folder / "results.json").read_text())["results"]["sweep"]
+    return json.loads((folder / "manifest.json").read_text())["results"]["sweep"]
 
 
 def count_parts(folder):

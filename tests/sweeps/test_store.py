@@ -203,17 +203,14 @@ def test_manifest_of_another_version(study_copy):
     (study_copy / MANIFEST).write_text(json_with_checksum(data))
     with pytest.raises(InputError, match="has format 99; this version reads 5"):
         open_study(study_copy)
-    # that of format 4 had another name, and its parts other headers
-    (study_copy / MANIFEST).rename(study_copy / "manifest.json")
+    # parts of format 4 had other headers
     for part in (study_copy / "points").iterdir():
         part.write_bytes(b"PAR1")
-    with pytest.raises(
-        InputError, match=r"was written by an earlier jaxbl; .* 'jaxbl sweep .*study\.toml --out NEW' makes it"
-    ):
-        open_study(study_copy)
-    with pytest.raises(
-        InputError, match=r"is not empty and holds no results with a results\.json \(an earlier jaxbl wrote none"
-    ):
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match=r"has format 99; .* or make the results anew in another folder"):
+            sweep(study(), study_copy, overwrite=overwrite)
+    (study_copy / MANIFEST).unlink()
+    with pytest.raises(InputError, match=r"is not empty and holds no results with a manifest\.json \(an earlier jaxbl"):
         sweep(study(), study_copy, overwrite=True)
 
 

@@ -1,22 +1,29 @@
-"""Public rules for the gains of super-twisting, compared with the exact condition.
+"""Public rules for the gains of super-twisting, compared with the exact condition: `python benchmarks/tuning_rules.py`.
+
+It prints the table of docs/theory_appendix.md, and draws docs/figures/tuning_rules.png (`--figure FILE`).
 
 A rule for a region allows intervals of lambda for each alpha and f_plus. The worst case shrinks as lambda grows. A rule is
 therefore sufficient if and only if every lambda that it allows is above the exact bound, and every alpha above f_plus.
 """
 
+import argparse
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbl.gains.error_system import normalised_peak_ratios
+from jaxbl.gains.under_tuned import SINE_LIMIT
 from jaxbl.json_types import JsonObject
-from jaxbl.observer.conditions import CONDITIONS, least_lambda_exact
+from jaxbl.observer.conditions import CONDITIONS, least_lambda_exact, peak_ratio
+from jaxbl.report.drawing import save
+from jaxbl.report.gain_plane import least_lambdas
+from jaxbl.report.panels import COLOURS, FAINT, MISSING, Axis, Band, Figure, Line, Panel, Part, Span, mark
 from jaxbl.sweeps.elementwise import call_in_float64
-
-from .error_system import normalised_peak_ratios
 
 Intervals = list[tuple[np.ndarray, np.ndarray]]
 """Intervals of lambda (rad^0.5/s), ends left out, for each alpha; empty where the first end is not below the second."""
@@ -167,7 +174,7 @@ RULES = {
         _intervals_quotient,
     ),
 }
-"""Rules by their names in `verdict.json`. Gains of a controller are for a disturbance whose derivative is within f⁺,
+"""Rules by name. Gains of a controller are for a disturbance whose derivative is within f⁺,
 which is the same error system."""
 
 _F_PLUS_TRIALS = (0.01, 0.1, 1.0, 10.0, 100.0)
@@ -256,7 +263,7 @@ def _share_covered(rule: Rule, alpha: np.ndarray, exact: np.ndarray, window: tup
 
 
 def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> list[JsonObject]:
-    """Judge every rule: the table `rules` of `verdict.json`.
+    """Judge every rule.
 
     Args:
         alpha: alpha / f_plus of the map of the error system, shape (alphas,).
@@ -324,3 +331,106 @@ def judge_rules(alpha: np.ndarray, lambda_: np.ndarray, ratio: np.ndarray) -> li
             }
         )
     return judged
+
+
+_ALPHA, _LAMBDA = (0.3, 20.0), (0.15, 25.0)
+"""Ends of the plane, alpha / f⁺ and lambda / √f⁺."""
+_LOOKS = tuple(zip((*COLOURS[:6], FAINT), ("-", "--", "-.", ":", "--", "-", "-."), strict=True))
+_MARKERS = ("D", "o", "s", "^")
+
+
+def draw_rules(rules: list[JsonObject]) -> Figure:
+    """The plane of gains with the exact border and the borders of all rules (`rules` of a verdict) at f⁺ = 1 rad/s²."""
+    x, y = Axis("α / f⁺", log=True, ends=_ALPHA), Axis("λ / √f⁺", log=True, ends=_LAMBDA)
+    titles = {True: "Sufficient: all gains allowed converge", False: "Not sufficient: where shaded, gains allowed fail"}
+    panels = []
+    for sufficient, title in titles.items():
+        alpha = np.geomspace(1.0001, _ALPHA[1], 400)
+        exact = least_lambdas(CONDITIONS["exact"], alpha, 1.0)
+        parts: list[Part] = [
+            Span(_ALPHA[0], 1.0, "does not converge", MISSING, opacity=0.55),
+            Band(alpha, np.full(400, _LAMBDA[0]), exact, "does not converge", MISSING, 0.55),
+        ]
+        looks, markers = iter(_LOOKS), iter(_MARKERS)
+        for rule in sorted(rules, key=lambda rule: rule["kind"] == "gains"):
+            if rule["sufficient"] != sufficient:
+                continue
+            if rule["kind"] == "region":
+                parts += _draw_region(rule, *next(looks))
+            else:
+                gains = rule["gains"]
+                parts.append(mark(gains["alpha"], gains["lambda"], rule["title"], next(markers), 7.0))
+        parts += [
+            Line([1.0, *alpha], [_LAMBDA[1], *exact], "exact, ρ < 1", width=2.4),
+            Line(alpha, SINE_LIMIT / np.sqrt(alpha), "a sine's limit cycle", width=1.2, dashes=":"),
+        ]
+        panels.append(Panel(x, y, parts, title))
+    caption = (
+        "Rules for gains at f⁺ = 1 rad/s²: each allows what is above its line, or between its two lines; "
+        "λ²/2α − λ⁴/16 < f⁺² allows what is below it. Grey: gains that do not converge under the worst disturbance. ×: "
+        "gains that the rule allows, simulated; a rule that depends on units may fail only at another f⁺ (its × is in units "
+        "of that). Dotted: below it a sine within f⁺ upholds a limit cycle, if there is no friction."
+    )
+    return Figure("tuning_rules", panels, caption, 2, 10.4, 5.4)
+
+
+def _draw_region(judged: JsonObject, colour: str, dashes: str) -> list[Part]:
+    """Borders of a rule's region; where it is wrong it is shaded."""
+    alpha, rule = np.geomspace(*_ALPHA, 1201), RULES[judged["name"]]
+    assert rule.intervals is not None
+    parts: list[Part] = []
+    wrong, failing = judged["counterexample"], least_lambdas(CONDITIONS["exact"], alpha, 1.0)
+    for low, high in rule.intervals(alpha, np.ones_like(alpha)):
+        for border, is_border in ((low, low > 0.0), (high, np.isfinite(high))):
+            parts.append(
+                Line(alpha, np.where((low < high) & is_border, border, np.nan), judged["title"], colour, 2.0, dashes)
+            )
+        if wrong is not None:
+            # what a rule allows although it fails
+            bottom, top = (np.clip(border, *_LAMBDA) for border in (low, np.minimum(high, failing)))
+            parts.append(Band(alpha, bottom, np.where(bottom < top, top, np.nan), "", colour))
+    if wrong is not None:
+        x, y = wrong["alpha"] / wrong["f_plus"], wrong["lambda"] / np.sqrt(wrong["f_plus"])
+        parts.append(Line([x], [y], colour=colour, width=0.0, marker="x", size=9.0))
+    return parts
+
+
+def _covers(rule: JsonObject) -> str:
+    covers = rule["covers"]
+    shares = [100.0 * entry["share"] for entry in covers]
+    if rule["scale_free"]:
+        return f"{shares[0]:.0f} %"
+    ends = f"{covers[0]['f_plus']:g} to {covers[-1]['f_plus']:g}"
+    return f"{min(shares):.0f} to {max(shares):.0f} %, by units (f⁺ from {ends} rad/s²)"
+
+
+def _wrong(rule: JsonObject) -> str:
+    """A counterexample in a sentence."""
+    wrong = rule["counterexample"]
+    gains = f"It allows λ = {wrong['lambda']:.3g} √rad/s, α = {wrong['alpha']:.3g} rad/s² at f⁺ = {wrong['f_plus']:g} rad/s²"
+    rho = wrong["peak_ratio_simulated"]
+    if rho is None or not np.isfinite(rho):
+        return f"{gains}: α is below f⁺, and under a constant disturbance f⁺ the error does not come back."
+    return f"{gains}: simulated under the worst disturbance, each peak of the error is {rho:.3g} times the last."
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the borders of all rules there, as PNG")
+    asked = parser.parse_args()
+    alpha, lambda_ = np.geomspace(1.02, 20.0, 256), np.geomspace(0.02, 25.0, 256)
+    judged = judge_rules(alpha, lambda_, np.asarray(peak_ratio(lambda_[:, None], alpha[None, :], np.ones((256, 256)))))
+    print("| rule | sufficient | least λ / exact | covers | counterexample | source |\n|---|---|---:|---|---|---|")
+    for rule in judged:
+        wrong = rule["counterexample"]
+        margin = None if rule["margin"] is None else f"{rule['margin']:.4g}"
+        cells = [rule["states"], "yes" if rule["sufficient"] else "no", margin]
+        cells += [_covers(rule) if rule["kind"] == "region" else "one pair", wrong and _wrong(rule), rule["source"]]
+        print(f"| {' | '.join('–' if cell is None else cell for cell in cells)} |")
+    if asked.figure is not None:
+        print(save(draw_rules(judged), asked.figure))
+
+
+if __name__ == "__main__":
+    with jax.enable_x64(True):
+        main()

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from tuning_rules import RULES, allows_gains, draw_rules, judge_rules
 
-from jaxbl.gains.rules import RULES, allows_gains, judge_rules
 from jaxbl.observer.conditions import least_lambda_exact, peak_ratio
 
 EXACT = jax.jit(least_lambda_exact)
@@ -153,3 +153,11 @@ def test_margins(judged_rules):
     gains = judged_rules["small_pair"]["gains"]
     assert (gains["lambda"], gains["alpha"], gains["f_plus"]) == (1.0, 1.1, 1.0)
     assert 0.98 < gains["peak_ratio_simulated"] < 1.0
+
+
+def test_the_figure_has_every_rule_on_its_side(judged_rules):
+    panels = draw_rules(list(judged_rules.values())).panels
+    names = [{getattr(part, "name", "") for part in panel.parts} for panel in panels]
+    for rule in judged_rules.values():
+        assert (rule["title"] in names[0]) == rule["sufficient"]
+        assert (rule["title"] in names[1]) != rule["sufficient"]
