@@ -184,8 +184,8 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
         _draw_bar(canvas, scales[0], cax=canvas.add_subplot(grid[:, columns]))
     if below:
         canvas.legend(below.values(), map(_plain, below), loc="lower center", ncols=fit)
-    # an engine of matplotlib's own, where a figure has one, lays out twice, and before each drawing
-    TightLayoutEngine(pad=0.5, rect=(0.0, foot / canvas.get_figheight(), 1.0, 1.0)).execute(canvas)
+    # before each drawing: what writes SVG would lay out anew, without room for the legend below
+    canvas.set_layout_engine(TightLayoutEngine(pad=0.5, rect=(0.0, foot / canvas.get_figheight(), 1.0, 1.0)))
     return canvas, axes
 
 
@@ -303,11 +303,9 @@ def _name_line(ax: Axes, line: Line) -> None:
     x, y = np.asarray(line.x), np.asarray(line.y)
     inside = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
     if len(inside):
-        i = inside[int(len(inside) * (0.95, 0.7, 0.5, 0.85, 0.6)[len(ax.texts) % 5])]
-        name = ax.annotate(
-            _plain(line.name), (x[i], y[i]), fontsize=8.5, ha="right", va="bottom", xytext=(0, 2),
-            textcoords="offset points", zorder=6, color="#111111",
-        )  # fmt: skip
+        # in the middle of the curve's width: beside it a name may stand on another one
+        i = inside[int(len(inside) * (0.45, 0.4, 0.6, 0.25, 0.5)[len(ax.texts) % 5])]
+        name = ax.text(x[i], y[i], _plain(line.name), fontsize=8.5, ha="center", va="center", zorder=6, color="#111111")
         name.set_path_effects([withStroke(linewidth=2.5, foreground="#FEFEFE")])
 
 
