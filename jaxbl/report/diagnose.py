@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import DOUBT, Lines
+from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
@@ -34,7 +34,7 @@ from .figures import (
     write_inside,
 )
 from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_table, percent, write_fit
+from .numbers import lead_with_doubt, number_table, write_fit
 from .residuals import draw_residuals, plot_torque
 
 _BEFORE, _AFTER = VERMILION, BLUE

@@ -6,12 +6,12 @@ import tomli_w
 
 from jaxbl.estimation.element import ElementIdentification
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines
+from jaxbl.lines import Lines, percent
 from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
 from .figures import BLUE, FAINT, ORANGE, Drawn, legend, outline, stacked, style, subplots
-from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write_fit
 
 _POINTS = 6000
 """Points of a cloud: a page is about 1000 pixels wide."""

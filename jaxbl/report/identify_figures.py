@@ -11,6 +11,7 @@ from matplotlib.colors import ListedColormap, LogNorm
 
 from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.identify import Identification
+from jaxbl.lines import percent
 from jaxbl.quantity import Quantity
 
 from .figures import (
@@ -39,7 +40,6 @@ from .figures import (
 )
 from .log_signals import LogSignals
 from .motor_alone_figures import draw_motor_alone
-from .numbers import percent
 
 Array = np.ndarray
 

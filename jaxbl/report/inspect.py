@@ -7,6 +7,7 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import to_jsonable, write_json
+from jaxbl.lines import percent
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectrum
@@ -29,7 +30,7 @@ from .figures import (
     style,
     subplots,
 )
-from .numbers import lead_with_doubt, percent
+from .numbers import lead_with_doubt
 
 _POINTS = 6000
 """Points of a line: a page is about 1000 pixels wide."""

@@ -14,7 +14,7 @@ from jaxbl.gains.limits import CONSTRAINT_COLUMNS
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, doubts_among
+from jaxbl.lines import Lines, doubts_among, percent
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
@@ -44,7 +44,7 @@ from .figures import (
 )
 from .gain_plane import conditions_line, name_gains, name_ratio
 from .maps import Cells, cell_edges, color_norm, condition_curves, flat_remark, hatch_failures, outline_effects, set_up_map
-from .numbers import lead_with_doubt, percent
+from .numbers import lead_with_doubt
 
 _CONDITIONS = {name: CONDITIONS[name] for name in ("davila_fridman", "seeber_horn", "exact")}
 
