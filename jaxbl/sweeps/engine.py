@@ -250,7 +250,7 @@ class Engine:
         return math.ceil(self.config.sweep.seeds / self.layout.seeds)
 
     def _seed_slice(self, index: int) -> np.ndarray:
-        """The seeds of a slice; all of them may be more than memory holds."""
+        """Return the seeds of a slice; all of them may be more than memory holds."""
         first, end = index * self.layout.seeds, min((index + 1) * self.layout.seeds, self.config.sweep.seeds)
         return self.config.sweep.first_seed + np.arange(first, end)
 
