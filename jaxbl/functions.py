@@ -20,6 +20,7 @@ from jaxtyping import Array
 from jaxbl.chain import Experiment, NamedArrays, Sample, Signals, TracedArrays, replay, scan, unit_noise
 from jaxbl.config import ConfigSource, read_config
 from jaxbl.config.study import suggest_path
+from jaxbl.control import AbstractReference, FunctionReference
 from jaxbl.drive.excitation import AbstractExcitation, FunctionInput
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
@@ -39,8 +40,8 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
     """Make the experiment of a study, whose numbers are arrays.
 
     Args:
-        study: TOML file, mapping, config, or an :class:`Experiment` that is put together from classes; its `excitation` may
-            be a plain function of time (s) that returns the torque (N m).
+        study: TOML file, mapping, config, or an :class:`Experiment` that is put together from classes; its `excitation` and
+            `reference` may be plain functions of time (s) that return torque (N m) and position (rad).
         precision: of the numbers; left out, the study's `[run] precision`, which is float64 unless it says otherwise.
 
     Raises:
@@ -60,6 +61,8 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
         )
     if not isinstance(study.excitation, AbstractExcitation):
         study = dataclasses.replace(study, excitation=FunctionInput(study.excitation))
+    if study.reference is not None and not isinstance(study.reference, AbstractReference):
+        study = dataclasses.replace(study, reference=FunctionReference(study.reference))
     return as_arrays(study, dtype)
 
 
@@ -135,12 +138,12 @@ def metrics(experiment: Experiment, seed: Any = 0, *, names: tuple[str, ...] | N
         InputError: there is no such metric.
     """
     columns = metric_columns(experiment, names)
-    found, _ = scan(experiment, seed, (metrics_reducer(names),))
+    values, _ = scan(experiment, seed, (metrics_reducer(names),))
     if needs_gain_metrics(names):
         for side, gains in observer_gains(experiment).items():
-            judged = compute_gain_metrics(*map(jnp.asarray, gains), found[f"{side}.f_plus"])
-            found |= {f"{side}.{name}": value for name, value in judged.items()}
-    return {name: found[name] for name in columns}
+            judged = compute_gain_metrics(*map(jnp.asarray, gains), values[f"{side}.f_plus"])
+            values |= {f"{side}.{name}": value for name, value in judged.items()}
+    return {name: values[name] for name in columns}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -220,9 +223,9 @@ def sweep_arrays(
         parts = []
         for start in range(0, count, points):
             indices = np.minimum(np.arange(start, start + points), count - 1)
-            found, gains = program.run({path: column[indices] for path, column in lanes.items()}, seed_values)
-            found = add_gain_metrics(found, gains) if needs_gain_metrics(names) else found
-            parts.append({name: np.asarray(found[name])[:, : count - start] for name in columns})
+            chunk, gains = program.run({path: column[indices] for path, column in lanes.items()}, seed_values)
+            chunk = add_gain_metrics(chunk, gains) if needs_gain_metrics(names) else chunk
+            parts.append({name: np.asarray(chunk[name])[:, : count - start] for name in columns})
     return Grid(
         {**axes, "seed": seed_values},
         {name: np.concatenate([part[name] for part in parts], 1).T.reshape(*shape, seeds) for name in columns},
