@@ -11,6 +11,7 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import shutil
 import signal
 import sys
@@ -154,8 +155,10 @@ def call(folder: Path, words: str) -> tuple[int, str]:
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
-    """All files of a folder with their bytes; a folder is its name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    """All files of a folder with their bytes, pages without their remarks, of which one tells how long compiling took."""
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    remarks = rb"<details><summary>Remarks.*?</details>"
+    return {name: re.sub(remarks, b"", bytes_) if name == "report.html" else bytes_ for name, bytes_ in files.items()}
 
 
 class Trials:

@@ -86,10 +86,10 @@ def _intervals_transcribed(alpha: np.ndarray, f_plus: np.ndarray) -> Intervals:
     ]
 
 
-_SMC_PSO = "github.com/theSadeQ/dip-smc-pso, "
+_SMC_PSO = "github.com/theSadeQ/dip-smc-pso"
 _CAMP = (
-    "github.com/Keeby-Astro/Constellation-Asteroid-Measurement-Project, "
-    "docs/algorithm_equations/Quaternion_Reaction_Wheel_Algorithm.m, "
+    "github.com/Keeby-Astro/Constellation-Asteroid-Measurement-Project/docs/algorithm_equations/"
+    "Quaternion_Reaction_Wheel_Algorithm.m, "
 )
 
 RULES = {
@@ -151,26 +151,26 @@ RULES = {
     "ordered": Rule(
         "λ > α",
         "λ > α > 0",
-        f"code read: {_SMC_PSO}src/controllers/smc/algorithms/super_twisting/twisting_algorithm.py",
+        f"code read: {_SMC_PSO}/src/controllers/smc/algorithms/super_twisting/twisting_algorithm.py",
         lambda alpha, f_plus: [_interval_where(alpha > 0.0, alpha)],
     ),
     "ordered_and_root": Rule(
         "λ > α, λ² > 2 f⁺",
         "λ > α > 0, λ² > 2 f⁺",
-        f"documentation read: {_SMC_PSO}docs/technical/mathematical_foundations.md",
+        f"documentation read: {_SMC_PSO}/docs/technical/mathematical_foundations.md",
         lambda alpha, f_plus: [_interval_where(alpha > 0.0, np.maximum(alpha, np.sqrt(2.0 * f_plus)))],
     ),
     "ordered_and_above": Rule(
         "λ > α > f⁺, λ² > 8 f⁺",
         "λ > 2 √(2 f⁺), α > f⁺, λ > α",
-        f"documentation read: {_SMC_PSO}docs/theory/lyapunov_stability_proofs.md, with input gain 1. It names the bound "
+        f"documentation read: {_SMC_PSO}/docs/theory/lyapunov_stability_proofs.md, with input gain 1. It names the bound "
         "that of the disturbance; here it is read as that of its derivative, f⁺",
         lambda alpha, f_plus: [_interval_where(alpha > f_plus, np.maximum(alpha, np.sqrt(8.0 * f_plus)))],
     ),
     "quotient": Rule(
         "α > λ²/2(λ − √2f⁺)",
         "λ > √(2 f⁺), α > λ² / (2 (λ − √(2 f⁺)))",
-        f"documentation read: {_SMC_PSO}docs/examples/mathematical_notation_standards.md",
+        f"documentation read: {_SMC_PSO}/docs/examples/mathematical_notation_standards.md",
         _intervals_quotient,
     ),
 }

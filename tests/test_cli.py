@@ -44,8 +44,8 @@ AXES = [listed_axis(ALPHA, 5.0, 9.0, 20.0)]
 GAINS = [listed_axis(ALPHA, 5.0, 9.0), listed_axis(LAMBDA, 3.0, 6.0)]
 
 NO_RESULTS = (
-    "{}: is not empty and holds no results with a manifest.json (an earlier jaxbl wrote none); choose another folder with "
-    "--out, where they are made anew"
+    "{}: is not empty and holds no results with a manifest.json (an earlier jaxbl wrote none there); choose another folder "
+    "with --out, where they are made anew"
 )
 
 
@@ -103,7 +103,7 @@ def test_a_sweep_and_its_second_call(tmp_path):
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
     folder = tmp_path / "results" / "study_map"
     assert list_files(folder) == [
-        "figures/line_motor_velocity_rmse.png", "points/part-00000.parquet", "report.html", "manifest.json", "study.toml",
+        "figures/line_motor_velocity_rmse.png", "manifest.json", "points/part-00000.parquet", "report.html", "study.toml",
     ]  # fmt: skip
     lines = first.stdout.splitlines()
     assert lines[0].startswith("✓ Good: 6 runs: the motor observer converges in ")

@@ -82,7 +82,7 @@ def test_closed_loop_against_scipy(page):
     np.testing.assert_allclose(closed.motor.true.position[:1000], states[:, 0], atol=2e-4 * np.ptp(states[:, 0]))
     np.testing.assert_allclose(closed.load.true.position[:1000], states[:, 1], atol=2e-4 * np.ptp(states[:, 1]))
     # the law itself: proportional, one sample later
-    expected = 2.0 * (1.0 - closed.motor.velocity_estimate[:-1])
+    expected = 20.0 * (1.0 - closed.motor.velocity_estimate[:-1])
     np.testing.assert_allclose(torque[1:], expected, rtol=1e-12)
 
 

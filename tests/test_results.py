@@ -93,7 +93,7 @@ def test_a_damaged_manifest_is_made_anew_or_refused(count_runs, tmp_path, case):
             summary.write_text("{")
         for read in (count_runs, lambda: read_result(summary))[1 - damaged_summary :]:
             with pytest.raises(
-                InputError, match=r"results\.json: is damaged \(.*\); begin anew with --overwrite, or choose"
+                InputError, match=r"manifest\.json: is damaged \(.*\); begin anew with --overwrite, or choose"
             ):
                 read()
         assert count_runs(overwrite=damaged_summary) == count + 1 == count_runs()
@@ -104,7 +104,7 @@ def test_a_folder_in_place_of_the_manifest_is_refused(count_runs, tmp_path):
     (tmp_path / "out" / MANIFEST).unlink()
     (tmp_path / "out" / MANIFEST).mkdir()
     (tmp_path / "out" / "identification.json").unlink()
-    with pytest.raises(InputError, match=r"results\.json: is damaged \(.*directory"):
+    with pytest.raises(InputError, match=r"manifest\.json: is damaged \(.*directory"):
         count_runs()
 
 

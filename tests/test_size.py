@@ -8,11 +8,11 @@ import size
 from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
-# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why: 395 948 is 393 921 and
+# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why: 395 939 is 393 921 and
 # the engine as functions, for which (and for the loop closed) a sum of 10 000 more is named.
 CEILINGS = {
-    "all": (395948, 0.04, 0.27, 0.0),
-    "report": (62166, 0.2, 1.17, 0.0),
+    "all": (395939, 0.03, 0.27, 0.0),
+    "report": (62157, 0.11, 0.95, 0.0),
     "diagnosis": (59529, 0.0, 0.0, 0.0),
     "records": (49404, 0.0, 0.0, 0.0),
     "gains": (36899, 0.0, 0.0, 0.0),

@@ -305,7 +305,9 @@ def _name_line(ax: Axes, line: Line) -> None:
     if len(inside):
         # in the middle of the curve's width: beside it a name may stand on another one
         i = inside[int(len(inside) * (0.45, 0.4, 0.6, 0.25, 0.5)[len(ax.texts) % 5])]
-        name = ax.text(x[i], y[i], _plain(line.name), fontsize=8.5, ha="center", va="center", zorder=6, color="#111111")
+        name = ax.text(
+            float(x[i]), float(y[i]), _plain(line.name), fontsize=8.5, ha="center", va="center", zorder=6, color="#111111"
+        )
         name.set_path_effects([withStroke(linewidth=2.5, foreground="#FEFEFE")])
 
 

@@ -166,7 +166,7 @@ def test_an_observer_that_does_not_converge_is_noted(logs):
 def test_the_extended_model_runs_and_the_report_says_what_was_found(diagnosis, tmp_path):
     result = write_report(diagnosis, tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "report.html"}
+    assert names == {"diagnosis.json", "model.toml", "trace.parquet", "figures", "manifest.json", "report.html"}
     assert result.verdict == "good" and result.headline.startswith("The model lacks motor.coulomb_friction; with it, it ")
     assert any(line.startswith("motor.coulomb_friction (confidence") and "± " in line for line in result.remarks)
     model = read_config(tmp_path / "model.toml")

@@ -136,7 +136,7 @@ def test_report_has_every_number_and_figure(identification, tmp_path):
     )
     assert lacking.verdict == "doubtful" and "(motor: 0.0002 rad rms, 2 times the noise)" in lacking.headline
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "report.html"}
+    assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "manifest.json", "report.html"}
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
     assert drawn == {"intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"}
     page = (tmp_path / "report.html").read_text()

@@ -10,7 +10,7 @@ import pytest
 from effect_values import VALUES
 
 from jaxbl.chain import Experiment, Run, move_plant, plant_trajectory
-from jaxbl.drive import Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, leaf_paths, set_leaves
+from jaxbl.drive import LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arrays, leaf_paths, set_leaves
 from jaxbl.drive.effects import SideEffect, make_effect
 from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
@@ -25,7 +25,12 @@ def make_experiment(names, rigid=False, substeps=1, extra=()):
     effects = (*(make_effect(name, **VALUES[name]) for name in names), *extra)
     law = LinearShaft(60.0) if "transmission.backlash" in names else SigmoidBacklash(1.0, 0.02, 20.0)
     result = Experiment(
-        drive, None if rigid else law, effects, Initial(), Sine(1.0, 1.0), None, None, None, None, Run(1e-3, STEPS, substeps)
+        drive=drive,
+        transmission=None if rigid else law,
+        effects=effects,
+        excitation=Sine(1.0, 1.0),
+        observer=None,
+        run=Run(1e-3, STEPS, substeps),
     )
     return as_arrays(result, np.float64)
 

@@ -29,7 +29,7 @@ def test_a_damaged_manifest_is_written_anew_where_that_is_asked_for(tmp_path):
     path = tmp_path / MANIFEST
     before = path.read_bytes()
     path.write_bytes(before[: len(before) // 2])
-    with pytest.raises(InputError, match=r"results\.json: is damaged \(.*\); begin anew with --overwrite"):
+    with pytest.raises(InputError, match=r"manifest\.json: is damaged \(.*\); begin anew with --overwrite"):
         run_stage(tmp_path)
     # what it said is found again; the stage's parts are there
     lanes, manifest, _ = run_stage(tmp_path, overwrite=True)

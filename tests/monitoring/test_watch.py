@@ -252,8 +252,8 @@ def test_the_command_leaves_files_and_ends_with_3_after_an_alarm(logs, tmp_path,
     assert any(line.startswith("✗ Failed: ALARM from ") for line in output)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "figures",
-        "report.html",
         "manifest.json",
+        "report.html",
         "watch.csv",
         "watch.json",
     ]

@@ -67,6 +67,7 @@ def test_groups_are_those_of_pandas():
 def store_result(folder, data, **columns):
     """A made-up study in parts."""
     result = make_result(data, **columns)
+    folder.mkdir()
     engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"))
     keys = [axis.path for axis in result.config.axes] + ["seed"]
     for index in range(len(engine)):

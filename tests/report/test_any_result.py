@@ -29,7 +29,7 @@ def test_a_notebook_shows_figures_with_captions_and_texts(study):
 def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):
     result = jaxbl.write_report(study, str(tmp_path / "a" / "b"))
     assert result.headline.startswith("20 runs: ") and result.sentences[0] == result.headline
-    assert sorted(file.name for file in (tmp_path / "a" / "b").iterdir()) == ["figures", "report.html", "manifest.json"]
+    assert sorted(file.name for file in (tmp_path / "a" / "b").iterdir()) == ["figures", "manifest.json", "report.html"]
 
 
 def test_each_kind_of_result_goes_to_its_own_functions():

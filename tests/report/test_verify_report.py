@@ -70,7 +70,7 @@ def test_page_and_lines(verify_report):
 @needs_chromium
 def test_the_page_in_a_browser(verify_report):
     with open_pages(verify_report[1] / "report.html") as (page,):
-        check_figures(page, 5)
+        check_figures(page, 4)
 
 
 def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_study, call, tmp_path, monkeypatch):

@@ -90,7 +90,7 @@ def test_damage_in_a_store_is_noticed_and_healed(bucket, disk_study, computed_ch
     assert sorted(computed_chunks) == [2, 5]
     assert "damaged/part-00002.parquet" in read_objects(address)
     (to_path(address) / MANIFEST).unlink()
-    with pytest.raises(InputError, match="has lost its results"):
+    with pytest.raises(InputError, match="has lost its manifest"):
         open_study(address)
     assert repair(address)[0] == 8
     pd.testing.assert_frame_equal(open_study(address).frame, disk_study[1].frame, check_exact=True)

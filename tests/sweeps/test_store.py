@@ -176,7 +176,7 @@ def test_a_manifest_that_is_lost_or_damaged_is_written_anew_by_what_the_parts_sa
         content(data["results"]["sweep"])
         file.write_text(json.dumps(data))
     before = read_files(study_copy)
-    with pytest.raises(InputError, match=r"has (lost its|a damaged) results\.json; 'jaxbl repair") as error:
+    with pytest.raises(InputError, match=r"has (lost its|a damaged) manifest\.json; 'jaxbl repair") as error:
         open_study(study_copy)
     assert "\n" not in str(error.value)
     assert read_files(study_copy) == before
@@ -191,7 +191,7 @@ def test_a_damaged_manifest_without_parts(study_copy):
     (study_copy / MANIFEST).write_text("{")
     for part in (study_copy / "points").iterdir():
         part.unlink()
-    with pytest.raises(InputError, match=r"results\.json: is damaged \(.*\); begin anew with --overwrite"):
+    with pytest.raises(InputError, match=r"manifest\.json: is damaged \(.*\); begin anew with --overwrite"):
         sweep(study(), study_copy)
     assert len(sweep(study(), study_copy, overwrite=True).frame) == 9
 
@@ -354,7 +354,7 @@ def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, finished_study):
 
 def test_folder_with_other_files_stays_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match=r"is not empty and holds no results with a results\.json"):
+    with pytest.raises(InputError, match=r"is not empty and holds no results with a manifest\.json"):
         sweep(study(), tmp_path, overwrite=True)
     assert read_files(tmp_path) == {"thesis.tex": b"mine"}
 

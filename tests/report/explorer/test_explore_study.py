@@ -115,7 +115,9 @@ def read_pointer_values(values):
 
 def find_place(page, x, y, chart=0, whole="#plot"):
     """A place within the axes of a chart, as shares of their lengths, in pixels of the page."""
-    box = page.locator(f"{whole} .u-over").nth(chart).bounding_box()
+    axes = page.locator(f"{whole} .u-over").nth(chart)
+    axes.wait_for()
+    box = axes.bounding_box()
     return box["x"] + x * box["width"], box["y"] + (1.0 - y) * box["height"]
 
 
