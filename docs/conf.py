@@ -95,5 +95,6 @@ def setup(app):
     app.connect("env-get-outdated", list_outdated_tutorials)
     app.connect("build-finished", warn_of_foreign_files)
 
+
 # names of attributes that several classes have, as of `position_error`: no link is made of them
 suppress_warnings = ["ref.python"]
