@@ -38,7 +38,8 @@ def test_plane_and_sentence_agree_with_the_numbers(case):
     np.testing.assert_allclose(np.asarray(band.high)[at][::80], least, rtol=1e-6)
     assert {"fails", "exact, ρ < 1", "usual rule"} <= {*names_of(panel)}
     # a star outside lies on the edge, and above and on the right are the same axes in units of f⁺
-    _, (ax,) = draw_canvas(drawing)
+    canvas, (ax,) = draw_canvas(drawing)
+    canvas.draw_without_rendering()
     (x,), (y,) = next(line for line in ax.lines if line.get_marker() == "*").get_data()
     low, high = ax.get_ylim()
     assert (x, y) == (max(alpha, ax.get_xlim()[0]), max(lambda_, low))
