@@ -80,6 +80,10 @@ def to_jsonable(value: Any) -> Any:
 _BEGIN_ANEW = "begin anew with --overwrite, or choose another folder with --out"
 
 
+class DamagedFile(InputError):
+    """A file is not what was written."""
+
+
 def checksum(content: bytes) -> str:
     """Return the CRC-32 of some bytes, 8 hexadecimal digits: it detects damage, not forgery."""
     return f"{zlib.crc32(content):08x}"
@@ -89,7 +93,7 @@ def read_json(path: Path) -> JsonObject:
     """Read a JSON object that :func:`json_with_checksum` made, without its checksum.
 
     Raises:
-        InputError: it cannot be read, or does not agree with its checksum.
+        DamagedFile: it cannot be read, or does not agree with its checksum.
     """
     try:
         data = json.loads(path.read_bytes())
@@ -100,7 +104,7 @@ def read_json(path: Path) -> JsonObject:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = str(error) if isinstance(error, OSError | ValueError) else "has no checksum"
-    raise InputError(f"{path}: is damaged ({reason}); {_BEGIN_ANEW}")
+    raise DamagedFile(f"{path}: is damaged ({reason}); {_BEGIN_ANEW}")
 
 
 def json_with_checksum(data: JsonObject) -> str:
@@ -450,7 +454,7 @@ class ResultFolder:
         data = read_json(path / MANIFEST)
         names = [name for entry in data.get("results", {}).values() for name in (*entry["files"], *entry.get("folders", ()))]
         if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in names):
-            raise InputError(f"{path / MANIFEST}: is damaged (names files in other folders); {_BEGIN_ANEW}")
+            raise DamagedFile(f"{path / MANIFEST}: is damaged (names files in other folders); {_BEGIN_ANEW}")
         if data.get("format") != FORMAT:
             raise InputError(
                 f"{path / MANIFEST}: has format {data.get('format')}; this version reads {FORMAT}; read it with the jaxbl "
@@ -551,7 +555,7 @@ def claim_folder(
             )
     except InputError as error:
         results = recover(folder)
-        if results is None and not (overwrite and "damaged" in str(error)):
+        if results is None and not (overwrite and isinstance(error, DamagedFile)):
             raise
     if results is None:
         remove(folder / MANIFEST)

@@ -1,6 +1,8 @@
 """The engine as functions: the page that shows them, beside SciPy and differences; and what they refuse."""
 
+import contextlib
 import dataclasses
+import io
 from pathlib import Path
 
 import jax
@@ -19,12 +21,16 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture(scope="module")
 def page():
     """The names that the page's blocks define."""
-    names = {"__name__": "page"}
+    names, printed = {"__name__": "page"}, ""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         for block in read_blocks(ROOT / "docs" / "functions.md"):
             if block.language == "python":
-                exec(compile(block.text, "functions.md", "exec"), names)
+                with contextlib.redirect_stdout(io.StringIO()) as output:
+                    exec(compile(block.text, "functions.md", "exec"), names)
+                printed = output.getvalue()
+            elif block.language == "output":
+                assert block.text == printed
     return names
 
 

@@ -27,7 +27,7 @@ from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.registry import Registry
 from jaxbl.validation import LARGEST, check_file, explain_missing_file, suggest_word
 
-from .libraries import Column, ColumnName, Columns, Selection, read_bag, read_mcap, read_mdf, read_tdms
+from .libraries import Column, ColumnName, Columns, Selection, read_at, read_bag, read_mcap, read_mdf, read_tdms
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
 _LIBRARY_READERS: tuple[tuple[bytes, str, Callable[..., Columns]], ...] = (
@@ -609,8 +609,7 @@ def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) 
                 continue
             name = name if name not in ("", "Name") else "t"
         elif own_times is not times and not np.array_equal(own_times, times, equal_nan=True):
-            is_finite = np.isfinite(own_times) & np.isfinite(column)
-            column = np.interp(times, own_times[is_finite], column[is_finite])
+            column = read_at(times, own_times, column)
             columns.notes.append(f"'{name}' was sampled at other times: it is interpolated to those of the first column.")
         name = name or f"column {i}"
         columns[name] = column

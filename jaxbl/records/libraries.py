@@ -61,6 +61,15 @@ class Column:
         return np.asarray(self.load(), dtype=dtype)
 
 
+def read_at(times: np.ndarray, own_times: np.ndarray, values: Any) -> np.ndarray:
+    """Return values at the times of a log, interpolated from times of their own; NaN, no value, outside of these."""
+    if np.array_equal(own_times, times, equal_nan=True):
+        return np.asarray(values)
+    values = np.asarray(values, float)
+    is_finite = np.isfinite(own_times) & np.isfinite(values)
+    return np.interp(times, own_times[is_finite], values[is_finite], left=np.nan, right=np.nan)
+
+
 def _import_library(name: str, kind: str, package: str = "") -> Any:
     try:
         return import_module(name)
@@ -102,9 +111,7 @@ def read_mdf(path: Path, _: Selection = ()) -> Columns:
 
     def load_channel(name: str, group: int, index: int) -> np.ndarray:
         signal = file.get(name, group=group, index=index)
-        has_these_times = group == longest or np.array_equal(signal.timestamps, times)
-        samples = signal.samples
-        return samples if has_these_times else np.interp(times, signal.timestamps, np.asarray(samples, dtype=float))
+        return read_at(times, signal.timestamps, signal.samples)
 
     columns = Columns(t=Column(lambda: times, len(times)))
     for name, places in file.channels_db.items():
@@ -237,7 +244,7 @@ def _recording_columns(
         if name not in loaded_values:
             load_topic(topic, [name])
         values = loaded_values[name]
-        return values if topic == main else np.interp(load_seconds(main), load_seconds(topic), values)
+        return values if topic == main else read_at(load_seconds(main), load_seconds(topic), values)
 
     count = counts[main]
     columns = Columns(t=Column(lambda: load_seconds(main), count))

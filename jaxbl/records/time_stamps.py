@@ -12,7 +12,7 @@ import pandas as pd
 from jaxbl.lines import DOUBT
 
 from .files import LogFile, read_log_file
-from .libraries import Column, ColumnName
+from .libraries import Column, ColumnName, read_at
 from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment
 from .table import LogTable, TimeTable
 
@@ -154,7 +154,7 @@ def _load_at(
         middles = 0.5 * (other_stamps[1:] + other_stamps[:-1])
         is_outside = (stamps < other_stamps[0]) | (stamps > other_stamps[-1])
         return np.where(is_outside, np.nan, values[np.searchsorted(middles, stamps)])
-    return np.interp(stamps, other_stamps, values, left=np.nan, right=np.nan)
+    return read_at(stamps, other_stamps, values)
 
 
 def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:

@@ -25,11 +25,13 @@ from jaxbl.result import VERDICTS, Result, ResultTable
 from .drawing import Picture, picture
 from .panels import Figure
 
+PAGE = "report.html"
+
 
 def write_page(folder: Path, result: Result, figures: Sequence[Figure], config: str) -> None:
     """Write figures into `figures/`, and `report.html` with the result, the figures and the study's TOML."""
     pictures = [(figure.name, picture(figure, folder / "figures" / f"{figure.name}.png")) for figure in figures]
-    write_atomic(folder / "report.html", format_page(result, pictures, config))
+    write_atomic(folder / PAGE, format_page(result, pictures, config))
 
 
 _SHORT = 8

@@ -35,7 +35,7 @@ from .identify_figures import draw_identification
 from .inspect import describe_inspection, draw_inspection, write_inspection
 from .maps import draw as draw_study
 from .observer_choice import describe_choice, draw_choice, write_choice
-from .page import write_page
+from .page import PAGE, write_page
 from .panels import Figure
 from .simulate import describe_trial, draw_trial, write_trial
 from .sweep import describe_sweep, write_sweep
@@ -59,7 +59,7 @@ class _Kind(NamedTuple):
     draw: Callable[[Any], list[Figure]]
     write: Callable[[Any, Path], str]
     subject: Callable[[Any], Subject]
-    file: str = "report.html"
+    file: str = PAGE
 
 
 def _of_summary(describe: Callable[[Any], Result]) -> Callable[[Any], Result]:
@@ -170,7 +170,9 @@ def write_report(result: Any, folder: str | Path | ResultFolder, described: Resu
             place = to_path(folder)
             stack.enter_context(lock_folder(place, wait=_WAIT))
             folder = ResultFolder.read(place) or ResultFolder(place, kind.subject(result))
-        draft = stack.enter_context(folder.write_files(kind.file, identity=identity))
+        # without details, of which one is how long compiling took: the same results have the same manifest
+        card = {"title": described.title, "sentences": replace(described, details=()).sentences}
+        draft = stack.enter_context(folder.write_files(kind.file, identity=identity, **card))
         config = kind.write(result, draft)
         write_page(draft, described, kind.draw(result), config)
     return described

@@ -11,7 +11,7 @@ import pandas as pd
 
 from .sweep import StudyResult
 
-LEAST_POINTS = 100
+_LEAST_POINTS = 100
 """Points below which no index is estimated: a tenth of them lies beside each of the ten harmonics that RBD-FAST counts."""
 _MOST_RUNS = 2**20
 """Runs that are read at most, from the first on: their indices are known to about 0.01."""
@@ -48,12 +48,12 @@ def rank_axes(result: StudyResult, error: str) -> list[AxisImportance]:
     """
     sweep = result.config.sweep
     axes = [axis for axis in result.config.axes if axis.values is None and axis.num is None]
-    if sweep.design == "grid" or (sweep.points or 0) < LEAST_POINTS:
+    if sweep.design == "grid":
         return []
     paths = [axis.path for axis in axes]
     points = _read_points(result, paths, error)
     inputs, outcomes = points[paths].to_numpy(), points[error].to_numpy()
-    if len(points) < LEAST_POINTS or np.ptp(outcomes) == 0.0:
+    if len(points) < _LEAST_POINTS or np.ptp(outcomes) == 0.0:
         return []
     problem = {"num_vars": len(paths), "names": paths, "bounds": [[axis.start, axis.stop] for axis in axes]}
     if sweep.design == "saltelli" and len(points) == sweep.points:  # its estimators need all of it

@@ -23,6 +23,7 @@ from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
     MANIFEST,
+    DamagedFile,
     ResultFolder,
     Subject,
     checksum,
@@ -188,9 +189,7 @@ class Store:
         try:
             results = ResultFolder.read(folder)
             lost = "has lost its"
-        except InputError as error:
-            if "damaged" not in str(error):
-                raise
+        except DamagedFile:
             results, lost = None, "has a damaged"
         if results is not None and "sweep" in results.entries:
             return cls(results)

@@ -26,7 +26,7 @@ from .rivals.cpp_chain import CppChain, NoCompiler, compile_library, find_compil
 from .rivals.cpp_studies import CppStudy
 from .rivals.diffrax_chain import DiffraxChain
 from .rivals.numba_chain import NumbaChain, compile_block_loop
-from .rivals.python_chain import PythonChain
+from .rivals.numpy_chain import NumpyChain
 from .studies import STUDIES, FusedStudy, prepare_study
 from .workload import Metrics, Workload
 
@@ -65,7 +65,7 @@ def make_entries(folder: Path, threads: int, devices: int) -> list[Entry]:
         Entry("jaxbl scan, one device", lambda w: ScanChain(w, 1), few_lanes),
         Entry("numba, blocks of lanes", lambda w: NumbaChain(w, threads), many_lanes, "numba"),
         Entry("diffrax, Euler, one device", DiffraxChain, few_lanes, "diffrax"),
-        Entry("NumPy, lane arrays", PythonChain, 2**12),
+        Entry("NumPy, lane arrays", NumpyChain, 2**12),
     ]
 
 
@@ -245,7 +245,7 @@ def _spread_lanes(lanes: int) -> np.ndarray:
 def _reference_metrics(lanes: int, steps: int) -> Metrics:
     """Figures of some of so many lanes by the plainest entry, in float64."""
     with _enable_precision("float64"):
-        return PythonChain(Workload(lanes, steps, "float64"), lanes=_spread_lanes(lanes))()
+        return NumpyChain(Workload(lanes, steps, "float64"), lanes=_spread_lanes(lanes))()
 
 
 def _check_entry(entry: Entry, precision: str, metrics: Metrics, reference: Metrics) -> float:

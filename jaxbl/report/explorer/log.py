@@ -1,6 +1,6 @@
 """Signals over time in a browser: a log and what models make of it, a simulated run, and what a watch saw."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.report.diagnose import describe_diagnosis
-from jaxbl.report.element import describe_element
-from jaxbl.report.identify import describe_identification
 from jaxbl.report.panels import missing_quantity
-from jaxbl.result import Result
-from jaxbl.sweeps.metrics import find_metric
 
 from .folder import Source, colours_of, points_writer, write_page
 
@@ -25,54 +20,26 @@ _LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_
            "displacement": "displacement"}  # fmt: skip
 
 
-def log_source(file: Path) -> Source:
-    """Results of `jaxbl identify`, `diagnose`, `simulate` or `watch`, by their summary, to be explored.
+def log_source(file: Path, title: str, sentences: Sequence[str]) -> Source:
+    """Results of `jaxbl identify`, `diagnose`, `simulate` or `watch`, by their summary, with what their page says.
 
     Raises:
         InputError: files are damaged or missing.
     """
-    summary, model = read_result(file), "model.toml"
-    if file.name == "diagnosis.json":
-        card = describe_diagnosis(summary)
-    elif file.name == "identification.json":
-        card = (describe_element if summary.get("kind") == "element" else describe_identification)(summary)
-    else:
-        # these keep no model beside their signals
-        card, model = (_describe_run if file.name == "summary.json" else _describe_values)(summary), file.name
-    table = "watch.csv" if file.name == "watch.json" else "trace.parquet"
+    summary, table = read_result(file), "watch.csv" if file.name == "watch.json" else "trace.parquet"
+    # a run and a watch keep no model beside their signals
+    model = "model.toml" if file.name in ("diagnosis.json", "identification.json") else file.name
 
     def write(out: Path, served: bool) -> bool:
         text, points = check_result(file.with_name(model)).read_text(encoding="utf-8"), check_result(file.with_name(table))
         frame = pd.read_csv(points) if points.suffix == ".csv" else pd.read_parquet(points)
         content = write_log(summary, frame, out)
-        content |= {"title": card.title, "lead": card.sentences, "config": text, "file": model}
+        content |= {"title": title, "lead": sentences, "config": text, "file": model}
         write_page(out, ("log",), content, scripts=not served)
         return False
 
     identity = str(summary.get("identity") or checksum(file.read_bytes()))
-    return Source(identity, card.sentences, write, {}, lambda: None, lambda: None)
-
-
-def _describe_run(summary: JsonObject) -> Result:
-    """Say how large the errors of a simulated run's observers are."""
-    metrics = summary["metrics"]
-    errors = [
-        f"the {side} observer {'converged' if metrics[f'{side}.converged'] else 'did not converge'}, with "
-        f"{metrics[f'{side}.velocity_rmse']:.3g} {find_metric(f'{side}.velocity_rmse').unit} of velocity error (rms)"
-        for side in POSITION_CHANNELS
-        if metrics.get(f"{side}.velocity_rmse") is not None
-    ]
-    answer = f"One run, seed {summary['seed']}: {'; '.join(errors) or 'it diverged'}."
-    return Result(summary["title"] or "A run", "good", answer, remarks=summary["remarks"])
-
-
-def _describe_values(summary: JsonObject) -> Result:
-    """Say what a watch saw, and when it raised the alarm."""
-    alarm = summary["alarm"]
-    answer = f"Watched: {summary['determined']} of {summary['values']} values were determined; no alarm."
-    if alarm is not None:
-        answer = f"Alarm from {alarm['t']:.1f} s on: the half gap is beyond {summary['alarm_gap']:g}."
-    return Result(summary["title"] or f"Watch of {Path(summary['file']).name}", "good", answer, remarks=summary["notes"])
+    return Source(identity, sentences, write, {}, lambda: None, lambda: None)
 
 
 def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:

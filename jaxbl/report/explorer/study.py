@@ -58,8 +58,9 @@ def study_source(folder: str | Path, sentences: Sequence[str] = ()) -> Source:
     )
 
 
-def comparison_source(file: Path) -> Source:
-    """Two sweeps at their common points, by `comparison.json`: both, and what the second one is of the first.
+def comparison_source(file: Path, _: str, sentences: Sequence[str]) -> Source:
+    """Two sweeps at their common points, by `comparison.json`: both, and what the second one is of the first; with the
+    sentences of its page.
 
     Raises:
         InputError: files are damaged or missing.
@@ -68,16 +69,14 @@ def comparison_source(file: Path) -> Source:
     config = read_config(check_result(folder / "study.toml"))
     config = config.model_copy(update={"sweep": config.sweep.model_copy(update={"seeds": 1})})
     names = [Path(name).name for name in summary["names"]]
-    changed = [change["metric"] for change in summary["metrics"] if change["changed"]]
-    lead = [f"{names[0]} and {names[1]}: {len(changed)} of {len(summary['metrics'])} metrics differ."]
 
     def write(out: Path, served: bool) -> bool:
         frame = pd.read_parquet(check_result(folder / "comparison.parquet")).assign(
             seed=config.sweep.first_seed, finite=True
         )
-        return write_study(StudyResult(config, frame), out, lead, studies=names)
+        return write_study(StudyResult(config, frame), out, sentences, studies=names)
 
-    return Source(checksum(file.read_bytes()), lead, write, {}, lambda: None, lambda: None)
+    return Source(checksum(file.read_bytes()), sentences, write, {}, lambda: None, lambda: None)
 
 
 def _lead(result: StudyResult) -> list[str]:

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from ..workload import Metrics, Workload, metrics_from_sums
-from .python_chain import constants_as
+from .numpy_chain import constants_as
 
 BLOCK_LANES = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""

@@ -1,5 +1,6 @@
 """Folders of every command are explored: what their pages hold, and that they draw it."""
 
+import dataclasses
 import json
 import shutil
 
@@ -34,27 +35,26 @@ def read_page(folder, out):
 def run_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     trial = run(small_study({"run.duration": 1.5}))
-    write_report(trial, folder)
-    return folder, trial
+    return folder, trial, write_report(trial, folder)
 
 
 def test_a_simulated_run_has_the_errors_of_its_observers(run_folder, tmp_path):
-    folder, trial = run_folder
+    folder, trial, card = run_folder
     data, table, _ = read_page(folder, tmp_path / "page")
     names = [group["name"] for group in data["groups"]]
     assert names[:2] == ["motor: velocity error", "motor: position error"] and "torque in the transmission" in names
     error = trial.trace["motor.velocity"] - trial.trace["motor.velocity_estimate"]
     np.testing.assert_allclose(table["motor.velocity_error"], error, rtol=1e-5, atol=1e-6)
     assert data["period"] == pytest.approx(1e-3) and "twist" in {one["column"] for one in data["coordinates"]}
-    assert data["lead"][0].startswith("One run, seed 0: the motor observer ")
+    assert (data["title"], data["lead"]) == (card.title, dataclasses.replace(card, details=()).sentences)
 
 
 def test_a_watch_has_both_observers_values(run_folder, tmp_path):
-    folder, _ = run_folder
+    folder, *_ = run_folder
     seen = watch(folder / "trace.parquet", small_study(), window=0.5, interval=0.2)
-    write_report(seen, tmp_path / "watch")
+    card = write_report(seen, tmp_path / "watch")
     data, table, _ = read_page(tmp_path / "watch", tmp_path / "page")
-    assert data["lead"][0].startswith("Watched: ") and data["file"] == "watch.json"
+    assert data["lead"] == dataclasses.replace(card, details=()).sentences and data["file"] == "watch.json"
     for group in data["groups"]:
         for line in group["lines"]:
             np.testing.assert_allclose(table[line["column"]], seen.values[line["column"]].astype(float), rtol=1e-5)
@@ -87,12 +87,13 @@ def test_a_comparison_is_a_map_of_factors(compared_folder, tmp_path):
 
 
 def test_a_verdict_has_the_runs_of_the_sampled_observers(verified_study, tmp_path):
-    verdict, folder = verified_study
+    verdict, folder = verified_study[0], tmp_path / "verified"
+    shutil.copytree(verified_study[1], folder)
+    card = write_report(verdict, folder)
     data, table, _ = read_page(folder, tmp_path / "page")
     assert len(table) == len(verdict.levels["sampled"]) and data["title"] == "small"
-    count = verdict.summary["counterexamples_in_all"]
     assert data["lead"][:3] == [
-        f"In {count} cases an observer failed although a gain condition held.",
+        card.headline,
         "Shown: sampled.",
         f"Others: drive; such as jaxbl explore {folder}/verify/drive.",
     ]
@@ -106,11 +107,9 @@ def test_tuned_gains_have_the_map_of_the_search(tmp_path):
     ends = {"start": 1.2, "stop": 8.0}
     study = rigid_study({"tune.num": 3, "tune.refine": 0, "tune.alpha_ratio": ends, "tune.lambda_ratio": ends})
     tuning = tune(study, tmp_path / "tuned")
-    write_report(tuning, tmp_path / "tuned")
+    card = write_report(tuning, tmp_path / "tuned")
     data, table, _ = read_page(tmp_path / "tuned", tmp_path / "page")
-    gains = tuning.summary["gains"]["motor"]
-    chosen = f"λ = {gains['lambda']:.4g} √rad/s, α = {gains['alpha']:.4g} rad/s²"
-    assert data["lead"][0] == f"The search for gains chose, motor: {chosen}."
+    assert data["lead"][0] == card.headline
     assert {axis["paths"][0]["path"] for axis in data["axes"]} == {ALPHA, LAMBDA, "seed"} and len(table) == 9
 
 
@@ -126,7 +125,7 @@ def test_pages_of_runs_and_comparisons_draw(run_folder, compared_folder, tmp_pat
 
 
 def test_the_newest_results_of_a_folder_count(run_folder, tmp_path):
-    folder, _ = run_folder
+    folder, *_ = run_folder
     shutil.copytree(folder, tmp_path / "both")
     with ResultFolder.read(tmp_path / "both").write_files("comparison.json") as draft:
         (draft / "comparison.json").write_text("{}")

@@ -13,7 +13,7 @@ def constants_as(kind: Callable[[float], Any]) -> tuple[Any, ...]:
     return tuple(kind(value) for value in (*chain_constants().values(), 0.0, 0.5, 4.0))
 
 
-class PythonChain:
+class NumpyChain:
     """One workload as a loop over time; `lanes` are the indices of those to run, left out: all."""
 
     def __init__(self, workload: Workload, lanes: np.ndarray | slice = slice(None)):
