@@ -10,19 +10,20 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.errors import InputError
 
 from .blocks import standard_errors_better
 from .confidence import Finding, weigh
-from .effect_search import EffectSearch, Explanation, VerdictName
+from .effect_search import EffectSearch, Explanation, UnfeltInput, VerdictName
 from .expected_errors import expected_errors, list_failed
 from .fitted_model import FittedModel
 from .history import Step
 from .neutral_effects import candidates
 from .reference_log import Comparison
 from .residuals import SideResiduals
-from .setup import Setup
+from .setup import Setup, doubt_input
 from .thresholds import LIMITS
 from .torque_tables import Tabulation, tabulate
 
@@ -74,13 +75,16 @@ class Choice:
     """Finds the model that stands.
 
     Attributes:
-        setup: the nominal model and the log.
+        setup: the nominal model and the log; another one, if the search finds that noise of the input did not act.
         search: for effects.
         before: the model as given on the log.
     """
 
     def __init__(self, setup: Setup):
-        self.setup, self.log = setup, setup.fitted
+        self._begin(setup)
+
+    def _begin(self, setup: Setup, *history: Step) -> None:
+        self.setup, self.log, self._quieter = setup, setup.fitted, None
         # a linear axis has no turns
         rotary = [name for name, kind in EFFECTS.items() if kind.rotary and name.partition(".")[0] in setup.sliding]
         stated, sought = setup.task.config.uncertainty, candidates(setup.bare)
@@ -90,12 +94,25 @@ class Choice:
                 f"{', '.join(sought)}"
             )
         exact = *stated.exact, *rotary
-        self.search = EffectSearch(setup.bare, setup.free, setup.prior.tolist(), self.log, exact, stated.expected)
+        prior = setup.prior.tolist()
+        self.search = EffectSearch(setup.bare, setup.free, prior, self.log, exact, stated.expected, self._is_felt)
+        self.search.history += history
         self.before = self.log.compare(setup.nominal)
+
+    def _is_felt(self, model: Experiment) -> bool:
+        """Tell whether the machine felt the input that drives models, by one of them."""
+        self._quieter = doubt_input(self.setup, model)
+        return self._quieter is None
 
     def choose(self) -> Chosen:
         """Search for effects, and settle the numbers."""
-        explanation = self.search.run()
+        try:
+            explanation = self.search.run()
+        except UnfeltInput as unfelt:
+            assert self._quieter is not None
+            reason = f"a model with {' and '.join(*unfelt.args)} shows that the machine did not feel it"
+            self._begin(self._quieter, Step("drive models without noise of the input", None, None, True, reason))
+            return self.choose()
         fitted, compared = explanation.fitted, self.search.compare(explanation.fitted)
         if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.difference:
             fitted, compared = self._as_given(fitted), self.before

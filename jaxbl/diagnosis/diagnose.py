@@ -128,11 +128,11 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
                 replays="excitation" in task.missing,
             )  # fmt: skip
         announce("smoothing the log")
-        setup = set_up(task)
+        choice = Choice(set_up(task))
         done()
         announce("comparing effects")
-        choice = Choice(setup)
         chosen = choice.choose()
+        setup = choice.setup
         if chosen.verdict == "no_discrepancy":
             _check_input_shown(setup, choice.search.fits.given.find_input_significance())
         done()

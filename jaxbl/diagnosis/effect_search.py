@@ -10,7 +10,7 @@ clearly says that something else is missing.
 """
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -109,6 +109,10 @@ class _Proposal(NamedTuple):
     variant: Candidate | None = None
 
 
+class UnfeltInput(Exception):
+    """Noise of the recorded input did not act on the machine: a model with these effects shows it."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Explanation:
     """The effects that a model lacks by a log.
@@ -143,6 +147,7 @@ class EffectSearch:
         log: ReferenceLog,
         exact: Collection[str] = (),
         expected: Collection[str] = (),
+        is_felt: Callable[[Experiment], bool] = lambda model: True,
     ):
         """Prepare to explain a log.
 
@@ -152,8 +157,9 @@ class EffectSearch:
             log: the log.
             exact: dotted paths of numbers that are known, and names of effects that are surely not missing.
             expected: names of effects that surely act: they are in the model from the first, and stay.
+            is_felt: whether by a model the machine felt all of the recorded input; asked of each that is accepted.
         """
-        self.log, self.expected, stated = log, expected, np.asarray(prior)
+        self.log, self.expected, self.is_felt, stated = log, expected, is_felt, np.asarray(prior)
         self.fits = self.stated = ModelFits(experiment, free, stated, log.segments)
         rough = np.hypot(stated, LIMITS.number_error)
         self.rough = ModelFits(experiment, free, rough, log.segments, LIMITS.effect_odds)
@@ -204,7 +210,11 @@ class EffectSearch:
     # ---- the loop ----
 
     def run(self) -> Explanation:
-        """Find what is missing."""
+        """Find what is missing.
+
+        Raises:
+            UnfeltInput: noise of the recorded input stands in the way.
+        """
         explanation = self._explain(self._begin())
         if self.fits is self.rough and self.passed_by is not None and not explanation.largest_gain > LIMITS.unknown:
             # a few effects may be likelier than numbers that are all off
@@ -234,6 +244,8 @@ class EffectSearch:
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
             current, gains = self._reduce(better or current, thorough=thorough)
+            if better is not None and not self.is_felt(current.experiment):
+                raise UnfeltInput(current.names)
             if better is not None or self._identify(current) not in visited:
                 continue
             rivals = {name: self._rivals(current, name) for name in current.names}

@@ -94,14 +94,30 @@ def set_up(task: DiagnosisTask) -> Setup:
     free = make_free_parameters(bare, default_paths(config, bare), signal_sizes(bare, recorded))
     prior = np.full(len(free), config.uncertainty.relative)
     _check_stable(task, nominal, ReferenceLog(recorded, {}, at_rest))
-    noise = _input_noise(input_rms(record), nominal, recorded)
-    segments = quiet(recorded, noise.unfelt)
+    return _drive_by_input(task, bare, nominal, free, prior, recorded, _input_noise(input_rms(record), nominal, recorded))
+
+
+def doubt_input(setup: Setup, model: Experiment) -> Setup | None:
+    """Set up anew if a model that explains more than the nominal one shows that noise of the input did not act."""
+    if setup.input_noise.unfelt > 0.0:
+        return None
+    noise = _input_noise(input_rms(setup.task.record), model, setup.recorded)
+    same = setup.task, setup.bare, setup.nominal, setup.free, setup.prior, setup.recorded
+    return _drive_by_input(*same, noise) if noise.unfelt > 0.0 else None
+
+
+def _drive_by_input(
+    task: DiagnosisTask, bare: Experiment, nominal: Experiment, free: tuple[FreeParameter, ...], prior: np.ndarray,
+    recorded: Sequence[Segment], noise: InputNoise,
+) -> Setup:  # fmt: skip
+    """Set up with the recorded input less what the drive did not feel of it."""
+    channels, segments = task.record.statistics.channels, quiet(recorded, noise.unfelt)
     lacking = residual_torques(nominal, segments)
-    sliding = [side for side in nominal.sides if record.statistics.channels[POSITION_CHANNELS[side]].unit == "m"]
+    sliding = [side for side in nominal.sides if channels[POSITION_CHANNELS[side]].unit == "m"]
     coordinates = all_coordinates(nominal, segments, lacking, sliding)
     located = localise(nominal, lacking, segments, coordinates)
     bandwidth = {name: place.bandwidth for name, place in located.items()}
-    fitted = ReferenceLog(segments, bandwidth, at_rest)
+    fitted = ReferenceLog(segments, bandwidth, task.config.log.initial_state == "rest")
     return Setup(task, sliding, bare, nominal, free, prior, recorded, fitted, lacking, coordinates, located, noise)
 
 
@@ -112,16 +128,14 @@ def quiet(segments: Sequence[Segment], noise: float) -> Sequence[Segment]:
     return [dataclasses.replace(segment, torque=smoothed_input(segment.torque, noise)) for segment in segments]
 
 
-def _input_noise(size: float, nominal: Experiment, segments: Sequence[Segment]) -> InputNoise:
-    """Noise of the channel that recorded the input, and whether the drive felt it; where it is small beside the input's rms
-    `size`, that is not asked."""
+def _input_noise(size: float, model: Experiment, segments: Sequence[Segment]) -> InputNoise:
+    """Noise of the channel that recorded the input, and whether the drive felt it by a model; where it is small beside the
+    input's rms `size`, that is not asked."""
     noise = estimate_white_noise([segment.torque for segment in segments])
     if not _NOISY * size < noise:
         return InputNoise(0.0, noise)
-    # the model as given: numbers that may change would absorb some of the noise
-    recorded, smooth = (
-        Linear(nominal, (), np.zeros(0), np.zeros(0), driven) for driven in (segments, quiet(segments, noise))
-    )
+    # at the model's numbers: those that may change would absorb some of the noise
+    recorded, smooth = (Linear(model, (), np.zeros(0), np.zeros(0), driven) for driven in (segments, quiet(segments, noise)))
     smoothness = recorded.choose(()).smoothness
     share, error = unfelt(recorded.find_errors_left(smoothness), smooth.find_errors_left(smoothness))
     # nats that it did not feel it, rather than did

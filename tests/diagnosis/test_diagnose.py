@@ -74,6 +74,18 @@ def test_noise_of_the_input_that_was_not_felt_does_not_drive_the_model(tmp_path)
     np.testing.assert_allclose(diagnosis.trace["u"], log.u, rtol=1e-9)
 
 
+def test_noise_of_the_input_is_asked_for_again_once_a_model_explains_more(tmp_path):
+    # the friction that is missing hides from the model as given that the drive did not feel this noise
+    simulate_multisine_log(torque_noise=0.004).write(tmp_path / "axis.csv")
+    task = read_diagnosis_task(tmp_path / "axis.csv", nominal_study())
+    with jax.enable_x64(True):
+        assert set_up(task).input_noise.unfelt == 0.0
+    summary = diagnose(tmp_path / "axis.csv", nominal_study()).summary
+    assert summary["history"][0]["tried"] == "drive models without noise of the input"
+    assert [finding["effect"] for finding in summary["findings"]] == ["motor.coulomb_friction"]
+    assert any(note.startswith("The channel u carries noise of 0.004") for note in summary["notes"])
+
+
 @pytest.mark.parametrize("felt", [False, True])
 def test_the_motion_tells_whether_noise_of_the_input_was_felt(felt, tmp_path):
     simulate_multisine_log(torque_noise=0.02, felt=felt).write(tmp_path / "axis.csv")
