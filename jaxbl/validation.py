@@ -1,11 +1,12 @@
 """Checks of what users write: files, sizes of data, strict tables. Each error is one line that says what is wrong."""
 
 import difflib
+import os
 import re
 import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -37,10 +38,30 @@ def check_file(path: Path, size_limit: int | None = None) -> None:
         OSError: there is no such file.
     """
     status = path.stat()
-    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
-        raise InputError("is a pipe or a device; a file is needed")
+    _check_end(status)
     if size_limit is not None and status.st_size > size_limit:
         raise InputError(f"has {status.st_size / 1e6:.0f} MB; it should have at most {size_limit / 1e6:.0f} MB")
+
+
+def _check_end(status: os.stat_result) -> None:
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+        raise InputError("is a pipe or a device; a file is needed")
+
+
+def open_regular_file(path: Path) -> BinaryIO:
+    """Open a file for reading, without waiting for whoever writes into a pipe that has taken its place.
+
+    Raises:
+        InputError: it is a pipe or a device. The message is without the path.
+        OSError: it cannot be opened, or is a folder.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        _check_end(os.fstat(descriptor))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
 
 
 def _check_not_tiny(number: float) -> float:

@@ -68,7 +68,7 @@ for _command in chain(*_GROUPS.values()):
 
 
 def main(run: Callable[[], object] = app) -> None:
-    """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 3 alarm of a watch, 130 interrupted."""
+    """Run a command: exit 0 done, 1 failed, 2 bad input (one line), 3 alarm of a watch, 4 blind, 130 interrupted."""
     try:
         run()
     except (InputError, NoResult) as error:

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 ALARM = 3
 """Exit code of a watch with an alarm."""
+BLIND = 4
+"""Exit code of a watch that did not see for longer than stated."""
 
 
 def inspect(
@@ -254,6 +256,10 @@ def watch(
     ] = None,
     window: Annotated[float, option("S", "seconds that each value is from")] = 10.0,
     interval: Annotated[float, option("S", "seconds between values", "--every")] = 1.0,
+    blind: Annotated[
+        float | None,
+        option("S", "seconds without a number after which the watch is blind: exit code 4 [default: 10 windows]"),
+    ] = None,
     follow: Annotated[bool, flag("--follow", "wait for more rows at the end of a text file, until Ctrl+C")] = False,
     out: Annotated[
         Path | None, option("DIR", "folder for the results [default: results/<log name>_watched; of a socket: none]")
@@ -262,7 +268,7 @@ def watch(
         bool, flag("--overwrite", "write into a folder that holds other results of a log or stream")
     ] = False,
 ) -> Outcome:
-    """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 if there was an alarm.
+    """Watch a drive's gap, stiffness and friction over a log or a stream; exit code 3 after an alarm, 4 if it did not see.
 
     Example: jaxbl watch log.csv --model axis.toml --alarm-gap 0.002
 
@@ -271,7 +277,7 @@ def watch(
     workers.start_jax()
     from jaxbl.monitoring.watch import read_watch_task
 
-    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
+    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, blind=blind, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), "watched", None)
     if folder is None:
         result = _watch_and_print(context, task, None)
@@ -282,7 +288,7 @@ def watch(
             result = _watch_and_print(context, task, folder)
             card = replace(jaxbl.describe(result), next_steps=after_watch(task, result.summary, model))
             jaxbl.write_report(result, results, card)
-    code = ALARM if result.summary["alarm"] else 0
+    code = ALARM if result.summary["alarm"] else BLIND if result.summary["blind"]["longest"] else 0
     return Outcome(card, folder, summary=result.summary, code=code)
 
 

@@ -49,6 +49,8 @@ _TOLERANCE = 0.02
 """Relative difference of a log's sampling period from the model's that gains do not notice."""
 _POLL = 0.1
 """Seconds for which rows are collected before they are processed: the latency of a stream, with the time that takes."""
+BLIND_WINDOWS = 10.0
+"""Windows without a number after which a watch is blind, where nothing else is stated."""
 _QUIET = 10.0
 """Seconds between remarks on a stream from which nothing comes, or from which rows are left out."""
 
@@ -67,7 +69,8 @@ class WatchTask:
         experiment: the study at the period of the rows, in float64.
         alarm_gap: half gap beyond which there is an alarm, rad (m); None for none.
         window: seconds that each value is from.
-        every: seconds between values.
+        interval: seconds between values.
+        blind: seconds without a number after which the watch says that it does not see.
         units: of the numbers, by side and name.
     """
 
@@ -78,6 +81,7 @@ class WatchTask:
     alarm_gap: float | None
     window: float
     interval: float
+    blind: float
     units: dict[str, dict[str, str]]
 
 
@@ -103,6 +107,7 @@ def watch(
     alarm_gap: float | None = None,
     window: float = 10.0,
     interval: float = 1.0,
+    blind: float | None = None,
     follow: bool = False,
     on_values: Callable[[Values], None] | None = None,
     ended: Callable[[], bool] | None = None,
@@ -116,6 +121,8 @@ def watch(
             alarm.
         window: seconds that each value is from.
         interval: seconds between values.
+        blind: seconds without a number, of rows or for want of rows, after which the watch says that it does not see; ten
+            windows if left out.
         follow: whether to wait for more rows at the end of a text file.
         on_values: called with each row of values as it comes.
         ended: called several times a second; a stream that is followed ends when it returns True.
@@ -123,7 +130,7 @@ def watch(
     Raises:
         InputError: unfit study, log or option, or rows that come at another period than the model's.
     """
-    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, follow=follow)
+    task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, blind=blind, follow=follow)
     return run_watch(task, on_values=on_values, ended=ended)
 
 
@@ -134,6 +141,7 @@ def read_watch_task(
     alarm_gap: float | None = None,
     window: float = 10.0,
     interval: float = 1.0,
+    blind: float | None = None,
     follow: bool = False,
 ) -> WatchTask:
     """Read study and log; arguments as of :func:`watch`.
@@ -141,7 +149,7 @@ def read_watch_task(
     Raises:
         InputError: as :func:`watch`.
     """
-    for name, number in (("alarm_gap", alarm_gap), ("window", window), ("every", interval)):
+    for name, number in (("alarm_gap", alarm_gap), ("window", window), ("every", interval), ("blind", blind)):
         if number is not None and not 0.0 < number < math.inf:
             raise InputError(f"{name.replace('_', '-')} is {number:g}; it should be positive")
     config, missing = read_model(model)
@@ -183,7 +191,8 @@ def read_watch_task(
         raise InputError(f"every is {interval:g} s; it should be at least the sampling period, {period:g} s")
     if record is not None and (longest := record.time[-1] - record.time[0]) < window:
         raise InputError(f"{source}: has {longest:.4g} s, window is {window:g} s; it should be shorter than the log")
-    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, _find_units(config, record))
+    blind = BLIND_WINDOWS * window if blind is None else blind
+    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, blind, _find_units(config, record))
 
 
 def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
@@ -229,7 +238,9 @@ def run_watch(
             try:
                 remark(f"watching {task.name}; Ctrl+C ends it")
                 for rows in _rows_of_stream(stream, ended or (lambda: False), remark):
-                    watcher.take(rows)
+                    for part in rows:
+                        watcher.take(part)
+                    watcher.check_sight()
             finally:
                 stream.source.close()
             counts = stream.counts
@@ -245,13 +256,12 @@ def _rows_of_record(record: Record) -> Iterator[Rows]:
 
 
 def _open_stream(task: WatchTask) -> Stream:
-    source: Source = (
-        Datagrams(task.name, stream_columns(task.config.log)) if "://" in task.name else FollowedFile(Path(task.name))
-    )
+    columns = stream_columns(task.config.log)
+    source: Source = Datagrams(task.name, columns) if "://" in task.name else FollowedFile(Path(task.name), columns)
     return Stream(source, task.config.log, float(task.experiment.run.sample_period))
 
 
-def _rows_of_stream(stream: Stream, has_ended: Callable[[], bool], remark: Callable[[str], None]) -> Iterator[Rows]:
+def _rows_of_stream(stream: Stream, has_ended: Callable[[], bool], remark: Callable[[str], None]) -> Iterator[list[Rows]]:
     last_rows = last_remark = time.monotonic()
     counts_before: dict[str, int] = {}
     while not has_ended():
@@ -266,7 +276,7 @@ def _rows_of_stream(stream: Stream, has_ended: Callable[[], bool], remark: Calla
             if stream.counts != counts_before:
                 remark(f"{stream.source.name}: {describe_counts(stream.counts)}{stream.source.fault}")
                 last_remark, counts_before = now, dict(stream.counts)
-        yield from rows
+        yield rows
 
 
 def describe_counts(counts: Mapping[str, int]) -> str:
@@ -285,7 +295,7 @@ def watch_columns(task: WatchTask) -> list[str]:
     """Return the columns of `watch.csv`."""
     names, law = _number_names(task.experiment)
     columns = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
-    columns += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction"]
+    columns += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction", "blind"]
     by_side = itertools.product(task.experiment.sides, names, ("", "_error"))
     return [*columns, *(f"{side}.{name}{end}" for side, name, end in by_side)]
 
@@ -302,6 +312,7 @@ class Watcher:
         columns: their names.
         samples: how many were taken in.
         start: time of the first one, s by the stamps; None before it.
+        longest_blindness: s without a number, by the rows that came, or by the clock if none did; 0 up to what was stated.
     """
 
     def __init__(self, task: WatchTask, on_values: Callable[[Values], None]):
@@ -315,12 +326,18 @@ class Watcher:
         self.samples = 0
         self.start: float | None = None
         self._due = task.interval
+        self._last_time = self.longest_blindness = 0.0
+        self._samples_seen, self._clock_seen = 0, time.monotonic()
+        self._clock_said = -math.inf
 
     def take(self, rows: Rows) -> None:
         """Take in rows, and make the values that are due within them."""
         if self.start is None:
             self.start = rows.time
         first, restarts, count = rows.time - self.start, rows.starts_segment, len(rows.torque)
+        if first < self._last_time:
+            # the sender's clock was set back: values are due by the new one
+            self._due = self._following_due(first)
         done = 0
         while done < count:
             # the row at which values are due, those of a gap in time once; half a period of slack: times are rounded
@@ -331,21 +348,37 @@ class Watcher:
             self._window.add(estimates, restarts)
             self.samples += end - done
             done, restarts = end, False
-            now = first + (end - 1) * self._period
+            now = self._last_time = first + (end - 1) * self._period
             if now >= self._due - 0.5 * self._period:
-                interval = self._task.interval
-                self._due = interval * (math.floor((now + 0.5 * self._period) / interval) + 1)
+                self._due = self._following_due(now)
                 if self._window.is_full:
-                    self._add_values(now)
+                    self._add_values(now, self._window.estimate())
 
-    def _add_values(self, now: float) -> None:
-        values = dict.fromkeys(self.columns, math.nan) | {"t": now, "side": "", "alarm": False, "contradiction": False}
-        windows = self._window.estimate()
+    def _following_due(self, now: float) -> float:
+        interval = self._task.interval
+        return interval * (math.floor((now + 0.5 * self._period) / interval) + 1)
+
+    def check_sight(self) -> None:
+        """Add a row without numbers where none has been found for longer than stated, as often as that has passed again."""
+        now = time.monotonic()
+        blind = max(now - self._clock_seen, (self.samples - self._samples_seen) * self._period)
+        if blind > self._task.blind and now - self._clock_said > self._task.blind:
+            self._clock_said = now
+            self._add_values(self._last_time, {}, blind)
+
+    def _add_values(self, now: float, windows: dict[str, SideNumbers], blind: float = 0.0) -> None:
+        values: Values = dict.fromkeys(self.columns, math.nan) | {"t": now, "side": ""}
+        values |= {"alarm": False, "contradiction": False, "blind": False}
         for side, window in windows.items():
             for name in self._names:
                 number = window.numbers[name]
                 values |= {f"{side}.{name}": number.value, f"{side}.{name}_error": number.standard_error}
         values |= self._judge_gap(windows)
+        if values["side"]:
+            self._samples_seen, self._clock_seen = self.samples, time.monotonic()
+        blind = max(blind, (self.samples - self._samples_seen) * self._period)
+        if blind > self._task.blind:
+            self.longest_blindness, values["blind"] = max(self.longest_blindness, blind), True
         self.values.append(values)
         self._on_values(values)
 
@@ -409,6 +442,7 @@ def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], not
         "alarms": len(alarms),
         "values": len(watcher.values),
         "determined": len(determined),
+        "blind": {"limit": task.blind, "longest": watcher.longest_blindness},
         "contradictions": sum(values["contradiction"] for values in determined),
         "first": drop_nan(determined[0]) if determined else None,
         "last": drop_nan(determined[-1]) if determined else None,
@@ -422,6 +456,8 @@ def format_values(values: Values, task: WatchTask) -> str:
     """Format values as a line for the terminal."""
     line = f"{values['t']:8.1f} s  "
     side, units = values["side"], task.units["motor"]
+    if values["blind"]:
+        return line + f"BLIND: no number for more than {task.blind:g} s"
     if not side:
         return line + "not determined: too little motion, or too few ways through the gap"
     parts = []

@@ -470,17 +470,19 @@ class TextFormat(NamedTuple):
             "index_col": False,
         }
 
-    def parse_numbers(self, lines: list[str]) -> np.ndarray:
-        """Parse rows into numbers, shape (rows, columns); NaN for a cell that is no number.
+    def parse_row(self, line: str) -> list[float] | None:
+        """Parse a row into numbers, NaN for a cell that is none; None if there are more cells or fewer."""
+        cells = _split_cells(line.partition("#")[0], self.separator)
+        if len(cells) != self.count:
+            return None
+        return [_parse_number(cell if self.decimal == "." else cell.replace(",", ".")) for cell in cells]
 
-        Lines with another number of cells are left out.
-        """
-        lines = [line for line in lines if len(_split_cells(line, self.separator)) == self.count]
-        if not lines:
-            return np.empty((0, self.count))
-        options = self.pandas_options() | {"names": None}
-        frame = pd.read_csv(io.StringIO("\n".join(lines)), **options)
-        return np.stack([pd.to_numeric(frame[i], errors="coerce").to_numpy(float) for i in range(self.count)], axis=1)
+
+def _parse_number(cell: str) -> float:
+    # Python reads 1_000 as well
+    with suppress(ValueError):
+        return math.nan if "_" in cell else float(cell)
+    return math.nan
 
 
 def has_cells(line: str) -> bool:
@@ -627,7 +629,10 @@ def _note_units(columns: Columns, units: Sequence[str]) -> None:
 
 
 def _split_cells(line: str, separator: str) -> list[str]:
-    cells = next(csv.reader([line], delimiter=separator), []) if len(separator) == 1 else line.split()
+    # a lone carriage return, or a cell without an end, makes the line one cell
+    cells = [line]
+    with suppress(csv.Error):
+        cells = next(csv.reader([line], delimiter=separator), []) if len(separator) == 1 else line.split()
     return [cell.strip() for cell in cells]
 
 

@@ -5,6 +5,7 @@ Columns and `[log]` table are those of a whole log. Unfit rows are counted and l
 
 import math
 import os
+import re
 import socket
 import threading
 import time
@@ -18,7 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from jaxbl.errors import InputError, shorten
-from jaxbl.validation import check_file
+from jaxbl.validation import LARGEST, open_regular_file
 
 from .channels import decode_words, to_si
 from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
@@ -29,7 +30,10 @@ from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 Block = tuple[Sequence[ColumnName], np.ndarray]
 """Names of columns, and numbers, shape (rows, columns)."""
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
+TOO_FAST = "datagrams that came faster than they could be taken in"
 LOST, GAPS, RESTARTS = "lost samples interpolated", "gaps in time", "restarts of the clock"
+OUTLIERS, OTHER_PERIOD = "rows far from both neighbours", "rows at another period"
+OTHER_FILES, OTHER_COLUMNS = "files that cannot be followed", "rows without a column that is needed"
 """Faults that are counted."""
 _READ_BYTES = 1 << 18
 """Bytes of a file that are read at once."""
@@ -37,12 +41,20 @@ _FILE_POLL_SECONDS = 0.02
 """Interval at which a file is read."""
 _BUFFER_BYTES = 1 << 22
 """Bytes of datagrams that the system is asked to buffer; it may buffer fewer."""
+_WAITING_BYTES = 1 << 28
+"""Bytes of datagrams that may wait to be taken in: a minute of 10 kHz."""
 _SOCKET_TIMEOUT = 0.1
 """Seconds after which the receiving thread checks whether its socket is to be closed."""
 _RESTART_SECONDS = 1.0
 """Seconds by which time goes back after a restart of the sender; datagrams overtake one another by less."""
 _PERIOD_ROWS, _PERIOD_STRIDE, _PERIOD_TOLERANCE = 256, 8, 0.02
 """Rows from which the sampling period is found, rows in each interval between two of them, and relative tolerance."""
+_OUTLIER_STEPS, _USUAL_STEPS = 100.0, 0.9
+"""Steps to and from an outlier, over the step of which this share is smaller: no drive turns around within a sample so."""
+_RECENT_ROWS = 256
+"""Rows before those that arrive, which say what steps are usual."""
+_BATCH_ROWS = 2048
+"""Rows that are taken at once: what comes in a burst leaves time to hear that the watch is to end."""
 _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 """Bytes of text; a datagram with other ones holds binary numbers."""
 
@@ -133,6 +145,7 @@ class _ChannelReader:
 
     def __init__(self, table: LogTable, name: str, columns: Sequence[ColumnName]):
         self._table, self._channels = table, _stream_channels(table)
+        self._positions = [table.position_source(name) for name in POSITION_CHANNELS.values()]
         file = LogFile(Path(name), Columns(dict.fromkeys(columns, ())))
         keys = {channel_table.column_or(channel): channel for channel, channel_table in self._channels.items()}
         self._indices = {
@@ -141,11 +154,11 @@ class _ChannelReader:
         self._previous: dict[str, float] = {}
         self._row = 0
 
-    def convert(self, values: np.ndarray) -> tuple[np.ndarray, int]:
-        """Convert values (rows, columns).
+    def decode(self, values: np.ndarray, period: float) -> tuple[np.ndarray, int]:
+        """Decode values (rows, columns); `period` (s) is what stamps have to resolve.
 
         Returns:
-            Samples: stamps (s), torque, motor and load position, shape (4, samples). Number of rows that were unreadable.
+            Stamps (s), torque, motor and load as they were sent, shape (4, samples). Number of rows that were unreadable.
         """
         # the same as pandas' comparison of a column with a number, true or false
         for column, required in (self._table.where or {}).items():
@@ -159,17 +172,33 @@ class _ChannelReader:
         torque_table = self._table.u or TorqueTable()
         torque = to_si(torque_table, decode_words(torque_table, values[:, self._indices[torque_table.column_or("u")]]))
         signals = [stamps, torque]
-        for name in POSITION_CHANNELS.values():
-            channel, position_table = self._table.position_source(name)
-            numbers = decode_words(position_table, values[:, self._indices[position_table.column_or(channel)]])
-            if isinstance(position_table, PositionTable) and position_table.minus is not None:
-                numbers = numbers - decode_words(position_table, values[:, self._indices[position_table.minus]])
+        is_readable = np.abs(stamps) * np.finfo(float).eps < 0.5 * period
+        for channel, table in self._positions:
+            numbers = decode_words(table, values[:, self._indices[table.column_or(channel)]])
+            if isinstance(table, PositionTable) and table.minus is not None:
+                numbers = numbers - decode_words(table, values[:, self._indices[table.minus]])
+            elif isinstance(table, PositionTable) and table.wrap is not None:
+                is_readable &= np.abs(numbers) <= 2.0 * table.wrap
             signals.append(numbers)
         samples = np.stack(signals)
-        samples = samples[:, np.isfinite(samples).all(axis=0)]
-        for i, name in enumerate(POSITION_CHANNELS.values(), 2):
-            samples[i] = self._read_position(name, samples[i], samples[0])
+        samples = samples[:, is_readable & (np.abs(samples) <= LARGEST).all(axis=0)]
         return samples, len(values) - samples.shape[1]
+
+    def steps(self, samples: np.ndarray) -> np.ndarray:
+        """Return the steps between decoded samples, shape (4, samples - 1), those of wrapped positions the shorter way."""
+        steps = np.diff(samples)
+        for i, (_, table) in enumerate(self._positions, 2):
+            if isinstance(table, PositionTable) and (wrap := table.wrap) is not None:
+                steps[i] = (steps[i] + 0.5 * wrap) % wrap - 0.5 * wrap
+        return steps
+
+    def convert(self, samples: np.ndarray) -> np.ndarray:
+        """Convert decoded samples, shape (4, samples), to SI units, with the turns that they belong to."""
+        positions = [
+            self._read_position(name, values, samples[0])
+            for name, values in zip(POSITION_CHANNELS.values(), samples[2:], strict=True)
+        ]
+        return np.stack([*samples[:2], *positions])
 
     def _read_position(self, name: str, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
         if not len(values):
@@ -206,59 +235,126 @@ class Stream:
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
         self._reader: _ChannelReader | None = None
-        self._columns: list[ColumnName] = []
+        self._columns: Sequence[ColumnName] = ()
+        self._block: Block | None = None
+        self._recent, self._held = np.empty((4, 0)), np.empty((4, 0))
         self._last = np.empty((4, 0))
         self._first_stamps: list[float] = []
-        self._is_period_checked = False
+        self._is_period_right: bool | None = None
 
     def poll(self, seconds: float) -> list[Rows]:
         """Return the rows that arrive within `seconds`.
 
         Raises:
-            InputError: a column is missing, or samples come at another period.
+            InputError: a column is missing, or samples come at another period, from the beginning on.
         """
-        block = self.source.poll(seconds)
+        block = self._block or self.source.poll(seconds)
         if block is None:
             return []
         columns, values = block
-        if self._reader is None or list(columns) != self._columns:
-            self._reader, self._columns = _ChannelReader(self._table, self.source.name, columns), list(columns)
-        samples, unreadable = self._reader.convert(values)
+        values, rest = values[:_BATCH_ROWS], values[_BATCH_ROWS:]
+        self._block = (columns, rest) if len(rest) else None
+        # each header has a list of its own: another file begins anew, with the same names, too
+        is_new = columns is not self._columns and not (isinstance(columns, range) and columns == self._columns)
+        if is_new and not self._read_columns(columns):
+            self._count(OTHER_COLUMNS, len(values))
+            return []
+        assert self._reader is not None
+        decoded, unreadable = self._reader.decode(values, self._period)
         self._count(UNREADABLE, unreadable)
+        samples = self._reader.convert(self._leave_out_outliers(self._reader, decoded))
         self._check_period(samples[0])
         return self._split_rows(samples)
+
+    def _read_columns(self, columns: Sequence[ColumnName]) -> bool:
+        """Read other columns from now on; False if there are columns that have been read, and one of these is missing."""
+        try:
+            reader = _ChannelReader(self._table, self.source.name, columns)
+        except InputError as error:
+            if self._reader is None:
+                raise
+            self.source.fault = f"; {shorten(str(error), 200)}"
+            return False
+        if self._reader is not None:
+            self._begin_anew()
+        self._reader, self._columns = reader, columns
+        return True
+
+    def _begin_anew(self) -> None:
+        """Forget what was before: another sender may have another clock, period and zero."""
+        self._recent = self._held = self._last = np.empty((4, 0))
+        self._first_stamps = []
 
     def _count(self, fault: str, number: int) -> None:
         if number:
             self.counts[fault] += number
 
+    def _leave_out_outliers(self, reader: _ChannelReader, samples: np.ndarray) -> np.ndarray:
+        """Leave out single rows far from both neighbours, which would move the observers or the clock for long.
+
+        A row at the end that is far from the one before is held until the next one has come.
+        """
+        recent = self._recent.shape[1]
+        samples = np.concatenate([self._recent, self._held, samples], axis=1)
+        steps = reader.steps(samples)
+        if steps.shape[1] > 1:
+            sizes = np.abs(steps)
+            usual = np.quantile(sizes, _USUAL_STEPS, axis=1)
+            # at standstill: a count
+            least = np.where(sizes > 0.0, sizes, np.inf).min(axis=1)
+            limits = _OUTLIER_STEPS * np.where(usual > 0.0, usual, least)
+            limits[0] = max(_RESTART_SECONDS, GAP_PERIODS * self._period)
+            is_far = sizes > limits[:, None]
+            is_outlier = np.any(is_far[:, :-1] & is_far[:, 1:] & (steps[:, :-1] * steps[:, 1:] < 0.0), axis=0)
+            is_outlier[: max(recent - 1, 0)] = False
+            is_first_outlier = recent == 0 and sizes.shape[1] > 2 and (is_far[:, 0] & ~is_far[:, 1]).any()
+            is_kept = np.concatenate([[not is_first_outlier], ~is_outlier, [True]])
+            end = samples.shape[1] - int(is_far[:, -1].any() and is_kept[-2])
+            self._held = samples[:, end:]
+            self._count(OUTLIERS, int(np.count_nonzero(is_outlier)) + int(is_first_outlier))
+            is_kept[:recent] = False
+            new = samples[:, :end][:, is_kept[:end]]
+        else:
+            self._held, new = samples[:, :0], samples[:, recent:]
+        self._recent = np.concatenate([self._recent, new], axis=1)[:, -_RECENT_ROWS:]
+        return new
+
     def _check_period(self, stamps: np.ndarray) -> None:
         """Compare the period of the first rows with the expected one."""
-        if self._is_period_checked:
+        if len(self._first_stamps) >= _PERIOD_ROWS:
             return
         self._first_stamps += stamps.tolist()
         if len(self._first_stamps) < _PERIOD_ROWS:
             return
-        self._is_period_checked, times = True, np.array(self._first_stamps)
+        times, fault = np.array(self._first_stamps), None
         measured = float(np.median(times[_PERIOD_STRIDE:] - times[:-_PERIOD_STRIDE])) / _PERIOD_STRIDE
         if not math.isclose(measured, self._period, rel_tol=_PERIOD_TOLERANCE):
-            raise period_error(self.source.name, measured, self._period)
-        if np.mean(np.diff(times) == 0.0) > 0.5:
-            raise InputError(
+            fault = period_error(self.source.name, measured, self._period)
+        elif np.mean(np.diff(times) == 0.0) > 0.5:
+            fault = InputError(
                 f"{self.source.name}: most rows have the time stamp of the row before; stamps should be finer than the "
                 "sampling period, or [log] t = { period = ... } says that there are none"
             )
+        if fault is not None and self._is_period_right is None:
+            raise fault
+        self._is_period_right = fault is None
+        if fault is not None:
+            self.source.fault = f"; {fault}"
 
     def _split_rows(self, samples: np.ndarray) -> list[Rows]:
         """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
         stamps = samples[0]
+        if self._is_period_right is False and len(self._first_stamps) >= _PERIOD_ROWS:
+            self._count(OTHER_PERIOD, len(stamps))
+            return []
         latest = np.maximum.accumulate(np.concatenate([[-np.inf], self._last[0], stamps]))[-len(stamps) - 1 : -1]
         is_restart = latest - stamps > _RESTART_SECONDS
         if is_restart.any():
             restart = int(np.argmax(is_restart))
             rows = self._split_rows(samples[:, :restart])
             self._count(RESTARTS, 1)
-            self._last = samples[:, :0]
+            self._last, self._first_stamps = samples[:, :0], []
+            self._check_period(stamps[restart:])
             return [*rows, *self._split_rows(samples[:, restart:])]
         is_later = stamps > latest
         self._count(DISORDERED, int(np.count_nonzero(~is_later)))
@@ -302,60 +398,126 @@ def period_error(name: str, measured: float, period: float) -> InputError:
 
 
 class _TextSource:
-    """Rows of text in the format of the first ones; attributes are those of a :class:`Source`."""
+    """Rows of text in the format of the first ones, or of a later header; attributes are those of a :class:`Source`.
 
-    def __init__(self, name: str):
+    Args:
+        name: for messages.
+        fields: columns that are needed.
+    """
+
+    def __init__(self, name: str, fields: Sequence[ColumnName]):
         self.name, self.counts, self.fault = name, Counter[str](), ""
+        self._fields = list(fields)
         self._format: TextFormat | None = None
         self._header = ""
 
-    def _parse_rows(self, text_format: TextFormat, lines: list[str]) -> np.ndarray:
-        """Parse lines into numbers, shape (rows, columns). Repeated headers are left out, malformed lines are counted."""
-        rows = [line for line in lines if line != self._header]
-        values = text_format.parse_numbers(rows)
-        if len(values) < len(rows):
-            self.counts[MALFORMED] += len(rows) - len(values)
-            self.fault = f"; a line should have {text_format.count} cells"
-        return values
+    def _parse_lines(self, text_format: TextFormat, lines: deque[str]) -> np.ndarray:
+        """Take lines, as far as they have one format, and parse them into numbers, shape (rows, columns).
+
+        Repeated headers are left out, malformed lines are counted. A header of other columns begins another format.
+        """
+        rows = list[list[float]]()
+        while lines:
+            line = lines[0]
+            if line != self._header and has_cells(line):
+                row = text_format.parse_row(line)
+                if (row is None or all(map(math.isnan, row))) and self._is_other_header(line):
+                    if rows:
+                        break
+                    self._format = text_format = detect_text_format([line])._replace(decimal=text_format.decimal)
+                    self._header = line
+                elif row is None:
+                    self.counts[MALFORMED] += 1
+                    self.fault = f"; a line should have {text_format.count} cells"
+                else:
+                    rows.append(row)
+            lines.popleft()
+        return np.array(rows).reshape(-1, text_format.count)
+
+    def _is_other_header(self, line: str) -> bool:
+        """Return True if a line names all columns that are needed."""
+        names = None
+        with suppress(InputError):
+            names = detect_text_format([line]).names
+        needed = {field for field in self._fields if isinstance(field, str)}
+        return names is not None and bool(needed) and needed <= {*names}
+
+    def _count_malformed(self, fault: str) -> bool:
+        self.counts[MALFORMED] += 1
+        self.fault = f"; the last: {shorten(fault, 200)}"
+        return False
 
 
 class FollowedFile(_TextSource):
     """Rows of a text file, from its beginning on, and those that are written to it later.
 
+    Args:
+        path: the file; another one may take its place, with columns of its own.
+        fields: columns that are needed; a later header counts if it has them.
+
     Raises:
         InputError: it cannot be read, or is no text.
     """
 
-    def __init__(self, path: Path):
-        super().__init__(str(path))
+    def __init__(self, path: Path, fields: Sequence[ColumnName] = ()):
+        super().__init__(str(path), fields)
         self._path = path
-        self._incomplete_line, self._lines = b"", list[str]()
+        self._incomplete_line, self._lines = b"", deque[str]()
+        self._is_too_long = False
+        self._previous_format: TextFormat | None = None
+        self._unfit_file = 0
         with name_file_in_errors(path, "name a text file"):
-            check_file(path)
-            self._file = path.open("rb")
+            self._file = open_regular_file(path)
 
     def poll(self, seconds: float) -> Block | None:
         end = time.monotonic() + seconds
-        while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
-            time.sleep(min(_FILE_POLL_SECONDS, remaining))
-        if not block:
-            return None
-        if b"\0" in block and self._format is None:
-            raise InputError(f"{self.name}: is no text: only text files are followed; leave --follow out")
-        *lines, self._incomplete_line = (self._incomplete_line + block).split(b"\n")
-        if len(self._incomplete_line) > MAX_LINE_BYTES:
-            raise InputError(f"{self.name}: has a line of more than {MAX_LINE_BYTES / 1e6:.0f} MB; it should have one a row")
-        self._lines += [line.decode("utf-8-sig", errors="replace").strip("\r") for line in lines]
-        rows = list(filter(has_cells, self._lines))
-        if self._format is None:
-            # the header and a row: the decimal sign shows only in a row
-            if len(rows) < 2:
+        if self._format is None or not self._lines:
+            while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
+                time.sleep(min(_FILE_POLL_SECONDS, remaining))
+            if not block:
                 return None
-            with name_file_in_errors(self.name):
-                self._format = detect_text_format(rows)
-            self._header = rows[0] if self._format.names is not None else ""
-        self._lines = []
-        return self._format.names or range(self._format.count), self._parse_rows(self._format, rows)
+            if b"\0" in block and self._format is None and self._previous_format is None:
+                raise InputError(f"{self.name}: is no text: only text files are followed; leave --follow out")
+            self._split_lines(block)
+        try:
+            if self._format is None and not self._detect_format():
+                return None
+        except InputError as error:
+            if self._previous_format is None:
+                raise InputError(f"{self.name}: {error}") from None
+            self._count_malformed(str(error))
+            self._lines.popleft()
+            return None
+        assert self._format is not None
+        rows = self._parse_lines(self._format, self._lines)
+        return self._format.names or range(self._format.count), rows
+
+    def _split_lines(self, block: bytes) -> None:
+        """Split what was read into lines, at lone carriage returns, too; the last one may be incomplete."""
+        *lines, self._incomplete_line = re.split(rb"\r\n|\r|\n", self._incomplete_line + block)
+        if len(self._incomplete_line) > MAX_LINE_BYTES:
+            self._incomplete_line, self._is_too_long = b"", True
+        if lines and self._is_too_long:
+            self._is_too_long = False
+            self._count_malformed(f"a line of more than {MAX_LINE_BYTES / 1e6:.0f} MB; there should be one a row")
+            lines = lines[1:]
+        texts = (line.decode("utf-8-sig", errors="replace") for line in lines)
+        self._lines += filter(has_cells, texts)
+
+    def _detect_format(self) -> bool:
+        """Detect the format from a header and a row, as the decimal sign shows only in a row; False before they are there.
+
+        A file that was cut off may go on without a header.
+        """
+        if len(self._lines) < 2:
+            return False
+        text_format, previous = detect_text_format([*self._lines]), self._previous_format
+        if text_format.names is None and previous is not None and previous.count == text_format.count:
+            text_format = text_format._replace(names=previous.names)
+        else:
+            self._header = self._lines[0] if text_format.names is not None else ""
+        self._format = text_format
+        return True
 
     def _read(self) -> bytes:
         block = self._file.read(_READ_BYTES)
@@ -365,13 +527,22 @@ class FollowedFile(_TextSource):
             except OSError:
                 return b""
             opened = os.fstat(self._file.fileno())
-            if current.st_ino != opened.st_ino or current.st_size < self._file.tell():
+            is_cut_off = current.st_size < self._file.tell()
+            if (current.st_ino != opened.st_ino or is_cut_off) and current.st_ino != self._unfit_file:
                 # cut off, or replaced by another file, which may have vanished again
-                with suppress(FileNotFoundError):
-                    file = self._path.open("rb")
-                    self._file.close()
-                    self._file, self._incomplete_line = file, b""
-                    block = self._file.read(_READ_BYTES)
+                try:
+                    file = open_regular_file(self._path)
+                except FileNotFoundError:
+                    return b""
+                except (OSError, InputError) as error:
+                    self._unfit_file = current.st_ino
+                    self.counts[OTHER_FILES] += 1
+                    self.fault = f"; {self.name}: {error}"
+                    return b""
+                self._file.close()
+                self._file, self._incomplete_line = file, b""
+                self._previous_format, self._format = self._format or self._previous_format, None
+                block = self._file.read(_READ_BYTES)
         return block
 
     def close(self) -> None:
@@ -390,8 +561,7 @@ class Datagrams(_TextSource):
     """
 
     def __init__(self, address: str, fields: Sequence[ColumnName]):
-        super().__init__(address)
-        self._fields = list(fields)
+        super().__init__(address, fields)
         self._has_numbered_fields = any(isinstance(field, int) for field in fields)
         host, port = _parse_address(address)
         try:
@@ -410,6 +580,8 @@ class Datagrams(_TextSource):
         self.port = self._socket.getsockname()[1]
         # Linux may buffer only some hundred datagrams, fewer than come at 10 kHz while values are computed
         self._received, self._closing = deque[bytes](), threading.Event()
+        self._received_bytes = self._taken_bytes = 0
+        self._blocks = deque[Block]()
         self._receiver = threading.Thread(target=self._receive, name="jaxbl-datagrams", daemon=True)
         self._receiver.start()
 
@@ -418,24 +590,34 @@ class Datagrams(_TextSource):
         while not self._closing.is_set():
             # nothing has come, or an error that concerns a single datagram
             with suppress(OSError):
-                self._received.append(self._socket.recv(1 << 16))
+                datagram = self._socket.recv(1 << 16)
+                if self._received_bytes - self._taken_bytes > _WAITING_BYTES:
+                    self.counts[TOO_FAST] += 1
+                    continue
+                self._received_bytes += len(datagram)
+                self._received.append(datagram)
 
     def poll(self, seconds: float) -> Block | None:
-        time.sleep(seconds)
-        datagrams = [self._received.popleft() for _ in range(len(self._received))]
-        parts, lines = list[np.ndarray](), list[str]()
-        for datagram in datagrams:
-            # lines of many datagrams are parsed at once: singly it takes too long at 10 kHz
+        if self._blocks:
+            return self._blocks.popleft()
+        if len(self._received) < _BATCH_ROWS:
+            time.sleep(seconds)
+        for datagram in [self._received.popleft() for _ in range(min(len(self._received), _BATCH_ROWS))]:
+            self._taken_bytes += len(datagram)
             if datagram.translate(None, _TEXT_BYTES):
-                parts += [self._parse_text(lines), self._parse_bytes(datagram)]
-                lines = []
+                self._add_rows(self._parse_bytes(datagram))
             else:
-                lines += datagram.decode().splitlines()
-        parts = [part for part in (*parts, self._parse_text(lines)) if len(part)]
+                lines = deque(datagram.decode().splitlines())
+                while lines:
+                    self._add_rows(self._parse_text(lines))
+        return self._blocks.popleft() if self._blocks else None
+
+    def _add_rows(self, rows: np.ndarray) -> None:
         columns = self._column_names()
-        # rows that came before the format was known may have other columns
-        parts = [part for part in parts if part.shape[1] == len(columns)]
-        return (columns, np.concatenate(parts)) if parts else None
+        if len(rows) and self._blocks and list(self._blocks[-1][0]) == list(columns):
+            rows = np.concatenate([self._blocks.pop()[1], rows])
+        if len(rows):
+            self._blocks.append((columns, rows))
 
     def _column_names(self) -> Sequence[ColumnName]:
         if self._format is not None and self._format.names is not None:
@@ -455,12 +637,11 @@ class Datagrams(_TextSource):
             return np.empty((0, width))
         return np.frombuffer(datagram, "<f8").reshape(-1, width)
 
-    def _parse_text(self, lines: list[str]) -> np.ndarray:
-        """Parse lines into numbers, shape (rows, columns). Lines before the first one in a fit format are malformed."""
-        lines = list(filter(has_cells, lines))
-        while lines and self._format is None and not self._detect_format(lines):
-            lines = lines[1:]
-        return np.empty((0, 0)) if self._format is None else self._parse_rows(self._format, lines)
+    def _parse_text(self, lines: deque[str]) -> np.ndarray:
+        """Take lines of one format, shape (rows, columns). Lines before the first one in a fit format are malformed."""
+        while lines and self._format is None and not (has_cells(lines[0]) and self._detect_format([*lines])):
+            lines.popleft()
+        return np.empty((0, 0)) if self._format is None else self._parse_lines(self._format, lines)
 
     def _detect_format(self, lines: list[str]) -> bool:
         """Detect the format from the first of some lines; False if that line is malformed."""
@@ -479,11 +660,6 @@ class Datagrams(_TextSource):
             return self._count_malformed(f"{text_format.count} cells in {lines[0]!r}; there should be {width}{fields}")
         self._format = text_format
         return True
-
-    def _count_malformed(self, fault: str) -> bool:
-        self.counts[MALFORMED] += 1
-        self.fault = f"; the last: {shorten(fault, 200)}"
-        return False
 
     def close(self) -> None:
         self._closing.set()

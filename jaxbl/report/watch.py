@@ -44,6 +44,12 @@ def describe_watch(watch: Watch) -> Result:
             f"ALARM from {alarm['t']:.1f} s on: the half gap is beyond {limit:g} {units['half_gap']}, "
             f"{alarm['half_gap']:.4g} ({alarm['half_gap_from']:.4g} to {alarm['half_gap_to']:.4g}) then."
         )
+    elif summary["blind"]["longest"]:
+        verdict = "failed"
+        headline = (
+            f"BLIND: no number for {summary['blind']['longest']:.4g} s, more than the {summary['blind']['limit']:g} s "
+            f"stated; {summary['determined']} of {count} values were determined."
+        )
     elif last is None:
         verdict = "no answer"
         headline = (
@@ -81,7 +87,7 @@ def describe_watch(watch: Watch) -> Result:
     title = task.config.title or f"Watch of {Path(task.name).name}"
     tables = [ResultTable("Numbers", columns, rows)]
     result = Result(title, verdict, headline, figures, remarks, summary["notes"], tables)
-    return result if alarm else lead_with_doubt(result)
+    return result if verdict == "failed" else lead_with_doubt(result)
 
 
 @contextmanager

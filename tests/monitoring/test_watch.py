@@ -408,3 +408,62 @@ def test_a_recording_in_mcap_is_watched_as_the_same_log_in_csv(growing_watch, lo
     pd.testing.assert_frame_equal(watch.values, growing_watch[0].values, rtol=1e-6)
     with pytest.raises(InputError, match=r"grown\.mcap: .*follow"):
         jaxbl.watch(tmp_path / "grown.mcap", data, follow=True, **WINDOW)
+
+
+def blind_logs(logs):
+    """Ways in which a drive is not seen in the second half of a log: text for its rows, by name."""
+    rows = pd.read_csv(logs / "same.csv")
+    still = rows.copy()
+    still.loc[still.index >= 5000, ["u", "theta_e", "theta_s"]] = [0.0, 0.3, 0.05]
+    stuck = rows.copy()
+    stuck.loc[stuck.index >= 5000, "theta_s"] = 0.05
+    return {"stands still": still, "an encoder stands still": stuck}
+
+
+@pytest.mark.parametrize("way", ["stands still", "an encoder stands still"])
+@pytest.mark.parametrize("follow", [True, False])
+def test_a_watch_that_does_not_see_says_so(way, follow, logs, tmp_path):
+    """In its values while it runs, in the summary, and on the page."""
+    log = tmp_path / "log.csv"
+    blind_logs(logs)[way].to_csv(log, index=False)
+    values = []
+    task = read_watch_task(log, logs / "axis.toml", follow=follow, alarm_gap=LIMIT, window=1.0, interval=0.5, blind=2.0)
+    result = run_watch(task, on_values=values.append, ended=end_after_looks(12))
+    first_blind = next(row["t"] for row in values if row["blind"])
+    assert 7.0 < first_blind < 9.0
+    assert result.summary["blind"]["limit"] == 2.0
+    assert 2.0 < result.summary["blind"]["longest"] < 5.0
+    card = jaxbl.write_report(result, tmp_path / "out")
+    assert (card.verdict, card.headline[:6]) == ("failed", "BLIND:")
+    longer = jaxbl.watch(log, logs / "axis.toml", window=1.0, interval=0.5, blind=6.0)
+    assert longer.summary["blind"]["longest"] == 0.0
+
+
+def test_a_stream_that_stops_is_said_to_be_blind_and_the_code_is_4(logs, tmp_path):
+    """The file says so while the watch runs."""
+    log = tmp_path / "log.csv"
+    log.write_text("".join((logs / "same.csv").read_text().splitlines(keepends=True)[:6000]))
+    words = ["watch", log, "--model", logs / "axis.toml", "--follow", *OPTIONS, "--blind", "1.5", "--out", tmp_path / "out"]
+    with start_command(*words, cwd=tmp_path, PYTHONUNBUFFERED="1") as process:
+        line = ""
+        while "BLIND: no number for more than 1.5 s" not in line and process.poll() is None:
+            line = process.stdout.readline()
+        assert pd.read_csv(tmp_path / "out" / "watch.csv")["blind"].tolist()[-1]
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=120)
+    assert process.returncode == 4, errors
+    assert "BLIND: no number for" in output
+
+
+@pytest.mark.parametrize("jump", [-4.0, 1.7e9, -1.7e9])
+def test_a_clock_that_is_set_does_not_blind_a_watch(jump, logs, tmp_path):
+    """Values go on by the new time."""
+    rows = pd.read_csv(logs / "same.csv")
+    rows.loc[rows.index >= 5000, "t"] += jump
+    rows.to_csv(tmp_path / "log.csv", index=False)
+    task = read_watch_task(tmp_path / "log.csv", logs / "axis.toml", follow=True, **WINDOW)
+    values = run_watch(task, ended=end_after_looks(12)).values
+    after = values[(values["t"] >= 5.0 + jump - 0.1) if jump > 0.0 else values.index > 2]
+    assert len(after) >= 8
+    assert (after["side"] != "").all()
+    assert np.abs(after["half_gap"] / HALF_GAP - 1.0).max() < 0.02

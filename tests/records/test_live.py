@@ -1,5 +1,6 @@
 """Rows that arrive one by one: the numbers of a log that is read whole. What is unfit is counted, and ends nothing."""
 
+import os
 import socket
 import threading
 import time
@@ -16,6 +17,10 @@ from jaxbl.records.live import (
     GAPS,
     LOST,
     MALFORMED,
+    OTHER_COLUMNS,
+    OTHER_FILES,
+    OTHER_PERIOD,
+    OUTLIERS,
     RESTARTS,
     UNREADABLE,
     Datagrams,
@@ -340,3 +345,184 @@ def test_polling_waits_no_longer_than_asked(datagrams):
     assert source.poll(0.3) is not None
     assert time.monotonic() - begin < 30.0
     sender.join()
+
+
+def follow(tmp_path, *writes, table=None):
+    """Rows and counts of a file on which `writes` (text to append, or functions of its path) follow one another."""
+    log = tmp_path / "log.csv"
+    log.write_text("")
+    stream = Stream(FollowedFile(log, stream_columns(table or LogTable())), table or LogTable(), PERIOD)
+    rows = []
+    for write in writes:
+        if callable(write):
+            write(log)
+        else:
+            with log.open("a", newline="") as file:
+                file.write(write)
+        for _ in range(20):
+            rows += stream.poll(0.0)
+    stream.source.close()
+    return rows, dict(stream.counts), stream.source.fault
+
+
+def make_text(rows, names=NAMES):
+    """A header and lines."""
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    return "\n".join([",".join(names), *lines]) + "\n"
+
+
+ROW = "{t!r},{u!r},{motor!r},{load!r}"
+BAD_ROWS = {
+    "stamp of 1e308": (ROW.replace("{t!r}", "1e308"), UNREADABLE),
+    "stamp of 1e14": (ROW.replace("{t!r}", "1e14"), UNREADABLE),
+    "stamp of 1e9": (ROW.replace("{t!r}", "1e9"), OUTLIERS),
+    "stamp of -5e4": (ROW.replace("{t!r}", "-5e4"), OUTLIERS),
+    "lone CR": (ROW.replace(",{load!r}", "\r,{load!r}"), MALFORMED),
+    "cell of 200 kB": (ROW.replace("{u!r}", "x" * 200_000), MALFORMED),
+    "line of 3 MB": ("1," * 1_500_000 + "\n" + ROW, MALFORMED),
+    "open quote": (ROW.replace("{load!r}", '"{load!r}'), None),
+    "quotes around two cells": (ROW.replace("{t!r},{u!r}", '"{t!r},{u!r}"'), MALFORMED),
+    "remark within": (ROW.replace(",{load!r}", "#,{load!r}"), MALFORMED),
+    "word": (ROW.replace("{motor!r}", "off"), UNREADABLE),
+    "underscore": (ROW.replace("{motor!r}", "1_000"), UNREADABLE),
+    "NUL": (ROW.replace("{motor!r}", "\0"), UNREADABLE),
+    "position of 1e300": (ROW.replace("{motor!r}", "1e300"), UNREADABLE),
+    "position of 1e20": (ROW.replace("{motor!r}", "1e20"), OUTLIERS),
+    "position of 500": (ROW.replace("{load!r}", "-500.0"), OUTLIERS),
+    "torque of 1e9": (ROW.replace("{u!r}", "1e9"), OUTLIERS),
+    "header of others": ("t,torque,theta_e,theta_s\n" + ROW, UNREADABLE),
+    "words": ("x,x,x,x\n" + ROW, UNREADABLE),
+}
+
+
+@pytest.mark.parametrize(("line", "fault"), BAD_ROWS.values(), ids=list(BAD_ROWS))
+def test_one_row_neither_ends_a_stream_nor_blinds_it(line, fault, tmp_path):
+    """It is counted as what it is, and all other rows are read."""
+    rows = make_rows(900)
+    bad_line = line.format(**dict(zip(("t", "u", "motor", "load"), rows[600].tolist(), strict=True)))
+    text = make_text(rows[:600]) + bad_line + "\n" + make_text(rows[601:]).partition("\n")[2]
+    parts, counts, _ = follow(tmp_path, text[:9000], text[9000:])
+    counts.pop(LOST, None)
+    assert counts == {} if fault is None else set(counts) == {fault}
+    assert not any(part.starts_segment for part in parts[1:])
+    np.testing.assert_allclose(np.concatenate([part.positions["motor"] for part in parts]), rows[:, 2], atol=5e-5)
+
+
+def test_a_wrapped_position_is_no_outlier_where_it_wraps(tmp_path):
+    """A turn forth and back at the wrap, and a reading beyond it."""
+    table = LogTable.model_validate({"theta_e": {"wrap": 1.0}})
+    motor = np.cumsum(np.tile([0.01, -0.01], 300)) + np.where(np.arange(600) < 300, 0.995, 3.995)
+    motor[300] = motor[299]
+    rows = make_rows(600)
+    rows[:, 2] = motor % 1.0
+    rows[450, 2] = 1e15
+    parts, counts, _ = follow(tmp_path, make_text(rows), table=table)
+    assert counts == {UNREADABLE: 1, LOST: 1}
+    positions = np.concatenate([part.positions["motor"] for part in parts])
+    assert np.abs(np.diff(positions)).max() < 0.02
+
+
+@pytest.mark.parametrize("replaced", [True, False], ids=["another file", "the same file"])
+@pytest.mark.parametrize("order", [[3, 2, 1, 0], [0, 2, 1, 3], [0, 1, 3, 2]])
+def test_a_new_header_is_read(order, replaced, tmp_path):
+    """Another order of columns, in the same file or in one that takes its place."""
+    rows = make_rows(1200)
+    text = make_text(rows[600:, order], [NAMES[i] for i in order])
+
+    def replace_file(log):
+        (log.parent / "new.csv").write_text(text)
+        (log.parent / "new.csv").rename(log)
+
+    parts, counts, _ = follow(tmp_path, make_text(rows[:600]), replace_file if replaced else text)
+    assert counts == {}
+    assert [part.starts_segment for part in parts if part.starts_segment] == [True, True]
+    np.testing.assert_array_equal(np.concatenate([part.positions["load"] for part in parts]), rows[:, 3])
+
+
+def replace_by_folder(log):
+    log.unlink()
+    log.mkdir()
+
+
+def replace_by_pipe(log):
+    log.unlink()
+    os.mkfifo(log)
+
+
+def replace_by_link_to_a_device(log):
+    log.unlink()
+    log.symlink_to("/dev/zero")
+
+
+def write_other_columns(log):
+    log.unlink()
+    log.write_text(make_text(make_rows(300), ["t", "u", "a", "b"]))
+
+
+def write_other_period(log):
+    rows = make_rows(900)
+    rows[:, 0] = 0.7 * rows[:, 0]
+    log.unlink()
+    log.write_text(make_text(rows))
+
+
+def write_nothing_that_is_text(log):
+    log.unlink()
+    log.write_bytes(bytes(range(256)) * 100)
+
+
+@pytest.mark.parametrize(
+    ("replace_file", "fault"),
+    [
+        (replace_by_folder, OTHER_FILES),
+        (replace_by_pipe, OTHER_FILES),
+        (replace_by_link_to_a_device, OTHER_FILES),
+        (write_other_columns, OTHER_COLUMNS),
+        (write_other_period, OTHER_PERIOD),
+        (write_nothing_that_is_text, None),
+    ],
+)
+def test_what_takes_the_place_of_a_file_is_said_and_ends_nothing(replace_file, fault, tmp_path):
+    """What can be followed afterwards is."""
+    rows = make_rows(600)
+
+    def write_again(log):
+        log.rmdir() if log.is_dir() else log.unlink()
+        (log.parent / "new.csv").write_text(make_text(rows))
+        (log.parent / "new.csv").rename(log)
+
+    parts, counts, said = follow(tmp_path, make_text(rows), replace_file, write_again)
+    assert fault is None or fault in counts
+    assert said
+    np.testing.assert_array_equal(np.concatenate([part.positions["motor"] for part in parts])[-600:], rows[:, 2])
+
+
+def test_a_file_that_is_cut_off_may_go_on_without_a_header(tmp_path):
+    rows = make_rows(1200)
+    parts, counts, _ = follow(
+        tmp_path,
+        make_text(rows[:900]),
+        lambda log: log.write_text(make_text(rows[900:1000]).partition("\n")[2]),
+        make_text(rows[1000:]).partition("\n")[2],
+    )
+    assert counts == {}
+    np.testing.assert_array_equal(np.concatenate([part.torque for part in parts]), rows[:, 1])
+
+
+def test_a_burst_is_taken_in_pieces():
+    source = BlockSource(make_rows(100_000))
+    stream = Stream(source, LogTable(), PERIOD)
+    sizes = [sum(len(rows.torque) for rows in stream.poll(0.0)) for _ in range(49)]
+    assert max(sizes) <= 2048
+    assert sum(sizes) == 100_000
+    assert stream.poll(0.0) == []
+
+
+def test_datagrams_with_another_header_are_read_by_it(datagrams):
+    source, send = datagrams
+    send(b"t,u,theta_e,theta_s\n0,1,2,3\n", b"theta_s,theta_e,u,t\n7,6,5,4\n", b"11,10,9,8\n", b"x,x,x\n")
+    blocks = [source.poll(0.1), source.poll(0.0)]
+    assert [list(columns) for columns, _ in blocks] == [NAMES, NAMES[::-1]]
+    np.testing.assert_array_equal(blocks[0][1], [[0, 1, 2, 3]])
+    np.testing.assert_array_equal(blocks[1][1], [[7, 6, 5, 4], [11, 10, 9, 8]])
+    assert source.counts == {MALFORMED: 1}
