@@ -3,19 +3,22 @@
 Needs the extra `distributed`. Functions that workers call are found by name: they have the same version of jaxbl installed.
 """
 
+import json
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from itertools import islice
-from threading import Lock
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, Union
 
-from .errors import InputError, NoResult
-from .workers import announce, count_cores, start_jax
+from .errors import InputError, NoResult, shorten
+from .workers import announce, check_cost, count_cores, start_jax
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -28,6 +31,10 @@ Scheduler = Union[str, "Client", "Cluster", None]
 
 _ANSWER_SECONDS = 15.0
 """Longest time in which a scheduler has to answer."""
+_LOCAL_A_CORE, _FEWEST_LOCAL = 2, 8
+"""Most local workers a core, and most on a machine with few: a job takes all cores of its worker."""
+_WORKER_BYTES = 6e8
+"""Bytes of a local worker that has imported JAX and compiled a study."""
 _POLL_SECONDS = 0.05
 """Time between two looks at which jobs have ended."""
 _AHEAD, _FEWEST_AHEAD = 4, 16
@@ -35,7 +42,7 @@ _AHEAD, _FEWEST_AHEAD = 4, 16
 scheduler nor client grows with the number of jobs (docs/speed.md)."""
 _COUNT_SECONDS = 2.0
 """Time between two counts of the workers."""
-_ONE_AT_A_TIME = Lock()
+_ONE_AT_A_TIME = threading.Lock()
 """A job uses all cores of its worker, whatever number of threads takes jobs there."""
 
 
@@ -91,6 +98,8 @@ class Cluster:
                     raise NoResult(_LOST)
                 if time.monotonic() - counted > _COUNT_SECONDS:
                     most, counted = max(_AHEAD * self.workers, _FEWEST_AHEAD), time.monotonic()
+                if not self._client.nthreads():
+                    announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
                 begun |= {future.key: (name, future) for future, (name, _) in zip(futures, more, strict=True)}
@@ -169,10 +178,8 @@ def connect(scheduler: Scheduler) -> Iterator[Cluster | None]:
     if scheduler is None or isinstance(scheduler, Cluster):
         yield scheduler
         return
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("--scheduler: needs Dask; install it with: pip install 'jaxbl[distributed]'") from None
+    if find_spec("distributed") is None:
+        raise InputError("--scheduler: needs Dask; install it with: pip install 'jaxbl[distributed]'")
     if not isinstance(scheduler, str):
         yield Cluster(scheduler, local=False)
         return
@@ -180,27 +187,63 @@ def connect(scheduler: Scheduler) -> Iterator[Cluster | None]:
     if kind == "local":
         if not number.isdecimal() or not 1 <= int(number) <= 1024:
             raise InputError(f"--scheduler {scheduler}: local:N needs the number of processes, 1 to 1024")
+        if int(number) > (most := max(_LOCAL_A_CORE * count_cores(), _FEWEST_LOCAL)):
+            raise InputError(f"--scheduler {scheduler}: {count_cores()} cores keep at most {most} processes busy")
+        check_cost(f"--scheduler {scheduler}", int(number) * _WORKER_BYTES, "it should be fewer processes")
         with _local(int(number)) as client:
             yield Cluster(client, local=True)
         return
-    file, address = (scheduler, None) if scheduler.endswith(".json") else (None, scheduler)
-    try:
-        client = Client(address, scheduler_file=file, timeout=_ANSWER_SECONDS, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there ({str(error).partition(chr(10))[0][:120]}); "
-            "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
-        ) from None
-    with client:
+    announce(f"waiting for the scheduler {scheduler}")
+    with _open_client(scheduler) as client:
         yield Cluster(client, local=False)
+
+
+def _open_client(scheduler: str) -> "Client":
+    """Connect to a scheduler by its address or file.
+
+    Dask waits for a file, and for the first word of whatever listens at a port, for ever: in a thread, which is left alone.
+    """
+    from distributed import Client
+
+    outcome: list[Any] = []
+
+    def open_client() -> None:
+        try:
+            address = str(json.loads(Path(scheduler).read_text())["address"]) if scheduler.endswith(".json") else scheduler
+            outcome.append(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
+        # whatever answers there, it is no scheduler
+        except Exception as error:
+            outcome.append(error)
+
+    thread = threading.Thread(target=open_client, name="jaxbl-connect", daemon=True)
+    thread.start()
+    thread.join(_ANSWER_SECONDS + 3.0)
+    if outcome and isinstance(outcome[0], Client):
+        return outcome[0]
+    fault = "nothing for as long as a scheduler takes"
+    if outcome:
+        fault = repr(outcome[0]) if isinstance(outcome[0], KeyError) else str(outcome[0])
+    raise InputError(
+        f"--scheduler {scheduler}: no Dask scheduler answers there ({shorten(fault.partition(chr(10))[0], 120)}); "
+        "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
+    )
 
 
 @contextmanager
 def _local(count: int) -> "Iterator[Client]":
-    """Processes of this machine as workers; they share its cores."""
-    from dask import config
-    from distributed import Client, LocalCluster
+    """Processes of this machine as workers; they share its cores, and keys that no other user of the machine has.
 
+    A scheduler runs the code that it is sent: without keys, that of whoever reaches its port.
+    """
+    from dask import config
+    from distributed import Client, LocalCluster, Security
+
+    try:
+        security = Security.temporary()
+    except ImportError:
+        raise InputError(
+            "--scheduler local:N: needs cryptography; install it with: pip install 'jaxbl[distributed]'"
+        ) from None
     announce("starting workers")
     # a process that was forked would share the locks of this one's compiler
     with (
@@ -213,6 +256,7 @@ def _local(count: int) -> "Iterator[Client]":
             dashboard_address="127.0.0.1:0",
             memory_limit=0,
             silence_logs=50,
+            security=security,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):

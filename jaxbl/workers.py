@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from .errors import NoResult, escape_unprintable
+from .errors import InputError, NoResult, escape_unprintable
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -30,6 +30,9 @@ _listeners: list[Callable[[str], None]] = []
 
 _PROCESS_MEMORY = 5 * 2**30
 """Bytes for each process: after twenty logs of many lengths one held 4.7e9."""
+_LONG = 10.0
+"""Seconds from which on it is said beforehand how long a task takes."""
+_UNITS = {"days": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 _MAPPING_LIMIT = 30_000
 """Memory mappings of a process: half of what Linux allows by default."""
 
@@ -66,14 +69,34 @@ def count_cores() -> int:
 
 
 def count_memory() -> int:
-    """Count the bytes of this machine's memory."""
-    if hasattr(os, "sysconf"):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    import ctypes
+    """Count the bytes of memory that this process may have: the machine's, or what its container leaves it."""
+    import psutil
 
-    kilobytes, libraries = ctypes.c_ulonglong(), getattr(ctypes, "windll")  # noqa: B009
-    libraries.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kilobytes))
-    return 1024 * kilobytes.value
+    limits = [psutil.virtual_memory().total]
+    for file in ("memory.max", "memory/memory.limit_in_bytes"):
+        # "max" is no limit
+        with suppress(OSError, ValueError):
+            limits.append(int(Path("/sys/fs/cgroup", file).read_text()))
+    return min(limits)
+
+
+def check_cost(task: str, memory: float, remedy: str, seconds: float = 0.0) -> None:
+    """Refuse a task that memory cannot hold, and announce how long one takes, before it begins.
+
+    Args:
+        task: what is to be done, the subject of a sentence.
+        memory: bytes that it takes, about.
+        remedy: how it takes less.
+        seconds: that it takes, about; 0 if not known.
+
+    Raises:
+        InputError: it takes more than there is.
+    """
+    if memory > (available := count_memory()):
+        raise InputError(f"{task} takes {memory / 1e9:.3g} GB of memory; here are {available / 1e9:.3g} GB; {remedy}")
+    if seconds > _LONG:
+        unit, count = next((unit, seconds / size) for unit, size in _UNITS.items() if seconds >= size)
+        announce(f"{task}: takes about {count:.2g} {unit}")
 
 
 def useful_processes(jobs: int) -> int:

@@ -9,16 +9,31 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import jax
+import numpy as np
+import pandas as pd
 import pytest
+import scipy.io
 from command_server import Process
-from small_study import ALPHA, listed_axis, rigid_study, small_study
+from small_study import ALPHA, listed_axis, multisine_study, rigid_study, small_study
 
+import jaxbl
 from jaxbl import workers
 from jaxbl.config import read_config
-from jaxbl.errors import NoResult
+from jaxbl.errors import InputError, NoResult
 from jaxbl.files import _try_lock_bytes
-from jaxbl.workers import _find_cache_folder, announce, clear_programs_if_needed, map_jobs, subscribe, useful_processes
+from jaxbl.records import read_record
+from jaxbl.sweeps.engine import Engine
+from jaxbl.workers import (
+    _find_cache_folder,
+    announce,
+    check_cost,
+    clear_programs_if_needed,
+    map_jobs,
+    subscribe,
+    useful_processes,
+)
 
 
 def square(x):
@@ -222,3 +237,73 @@ def test_locks_of_windows_exclude_one_another(tmp_path, monkeypatch):
         assert _try_lock_bytes(file, shared=True) and not _try_lock_bytes(file, shared=False)
         locked.clear()
         assert _try_lock_bytes(file, shared=False) and not _try_lock_bytes(file, shared=True)
+
+
+def test_what_memory_cannot_hold_is_refused_and_what_takes_long_is_said(monkeypatch):
+    monkeypatch.setattr(workers, "count_memory", lambda: 8_000_000_000)
+    with pytest.raises(InputError, match=r"^a trace takes 9 GB of memory; here are 8 GB; make it shorter$"):
+        check_cost("a trace", 9e9, "make it shorter", 1e4)
+    said = []
+    with subscribe(said.append):
+        for seconds in (0.0, 9.0, 90.0, 7200.0, 1e6):
+            check_cost("it", 7e9, "", seconds)
+    assert said == ["it: takes about 1.5 min", "it: takes about 2 h", "it: takes about 12 days"]
+
+
+def cost_simulation(folder, scale):
+    jaxbl.run(small_study({"run.duration": 1e3 * scale}))
+
+
+def cost_chunk(folder, scale):
+    jaxbl.dry_run(small_study({"sweep.seeds": 10**9, "sweep.chunk": int(4e6 * scale)}))
+
+
+def cost_list_of_chunks(folder, scale):
+    Engine(read_config(small_study({"sweep.seeds": int(2e7 * scale), "sweep.chunk": 2}))).chunk_order()
+
+
+def cost_window(folder, scale):
+    jaxbl.watch("udp://127.0.0.1:1", multisine_study(1.0), window=1e3 * scale, ended=lambda: True)
+
+
+def cost_parquet(folder, scale):
+    log = pd.DataFrame({name: np.zeros(int(1e6 * scale)) for name in ("t", "u", "theta_e", "theta_s")})
+    log["t"] = np.arange(len(log)) * 1e-3
+    log.to_parquet(folder / "log.parquet")
+    read_record(folder / "log.parquet")
+
+
+def cost_hdf5(folder, scale):
+    with h5py.File(folder / "log.h5", "w") as file:
+        for name in ("t", "u", "theta_e", "theta_s"):
+            file.create_dataset(name, data=np.zeros(int(1e6 * scale)), compression="gzip")
+    read_record(folder / "log.h5")
+
+
+def cost_matlab(folder, scale):
+    columns = {name: np.zeros((int(1e6 * scale), 1)) for name in ("t", "u", "theta_e", "theta_s")}
+    scipy.io.savemat(folder / "log.mat", columns, do_compression=True)
+    read_record(folder / "log.mat")
+
+
+@pytest.mark.parametrize(
+    "task",
+    [cost_simulation, cost_chunk, cost_list_of_chunks, cost_window, cost_parquet, cost_hdf5, cost_matlab],
+)
+def test_each_command_refuses_what_the_machine_cannot_hold(task, tmp_path, monkeypatch):
+    """In one line and before it begins; the size is drawn anew for each."""
+    scale = np.random.default_rng(len(task.__name__)).uniform(1.0, 2.0)
+    monkeypatch.setattr(workers, "count_memory", lambda: 50_000_000)
+    monkeypatch.setattr("jaxbl.records.files._VALUE_BYTES", 60.0)
+    with pytest.raises(InputError, match=r"takes \d[\d.]* GB of memory; here are 0\.05 GB; ") as error:
+        task(tmp_path, scale)
+    assert "\n" not in str(error.value)
+
+
+def test_a_study_of_a_billion_seeds_has_its_chunks_at_once():
+    """All seeds, each in one chunk, without a list of them."""
+    engine = Engine(read_config(small_study({"sweep.seeds": 10**9, "sweep.first_seed": 5})))
+    chunks = [engine.chunk(index) for index in (0, 1, len(engine) - 1)]
+    assert chunks[0].seeds[0] == 5
+    assert chunks[1].seeds[0] == chunks[0].seeds[-1] + 1
+    assert chunks[2].seeds[-1] == 10**9 + 4

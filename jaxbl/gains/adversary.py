@@ -7,6 +7,7 @@ its sequence with parts flipped, steady and random switching, and feedback by re
 
 import functools
 import math
+import time
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxbl.observer.super_twisting import DISCRETISATIONS, AbstractSuperTwisting
+from jaxbl.workers import check_cost
 
 from . import reachable
 from .invariant_set import ErrorSystem, Proof
@@ -238,8 +240,14 @@ def search_violations(
                 np.asarray, _run_adversaries(observer, bound, push, lanes, sequence, limits, np.asarray(settled), record)
             )
 
+        period = round(1.0 / _SHARE_FROM_START)
         for batch in range(batches):
-            from_start = batch % round(1.0 / _SHARE_FROM_START) == 0
+            # batches of both kinds have compiled
+            if batch == 1:
+                began = time.monotonic()
+            elif batch == 1 + period:
+                check_cost("a search for a counterexample", 0.0, "", (time.monotonic() - began) * batches / period)
+            from_start = batch % period == 0
             lanes = _draw_adversaries(rng, system, (position, velocity) if from_start else (0.0, 0.0))
             limits = all_bounds if from_start else final_bounds
             largest, went_above, latest_samples, _ = run(lanes, limits)

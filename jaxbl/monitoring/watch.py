@@ -32,7 +32,7 @@ from jaxbl.records.live import (
     stream_columns,
 )
 from jaxbl.units import on_a_line
-from jaxbl.workers import limit_blas_threads
+from jaxbl.workers import check_cost, limit_blas_threads
 
 from .live_chain import LiveChain
 from .window import BLOCKS, SETTLING, SideNumbers, Window
@@ -47,6 +47,8 @@ _WIDEST = 0.25
 """Half width of the 95 % interval of a gap that counts as determined, over the gap or, where that is larger, the model's."""
 _TOLERANCE = 0.02
 """Relative difference of a log's sampling period from the model's that gains do not notice."""
+_SAMPLE_BYTES = 1000.0
+"""Bytes of a sample of the window: its columns, and those of the regression by both sides."""
 _POLL = 0.1
 """Seconds for which rows are collected before they are processed: the latency of a stream, with the time that takes."""
 BLIND_WINDOWS = 10.0
@@ -189,6 +191,7 @@ def read_watch_task(
         )
     if interval < period:
         raise InputError(f"every is {interval:g} s; it should be at least the sampling period, {period:g} s")
+    check_cost(f"a window of {window:g} s", _SAMPLE_BYTES * window / period, "window should be shorter")
     if record is not None and (longest := record.time[-1] - record.time[0]) < window:
         raise InputError(f"{source}: has {longest:.4g} s, window is {window:g} s; it should be shorter than the log")
     blind = BLIND_WINDOWS * window if blind is None else blind

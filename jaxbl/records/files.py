@@ -26,6 +26,7 @@ from pandas.api.types import is_numeric_dtype
 from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.registry import Registry
 from jaxbl.validation import LARGEST, check_file, explain_missing_file, suggest_word
+from jaxbl.workers import check_cost
 
 from .libraries import Column, ColumnName, Columns, Selection, read_at, read_bag, read_mcap, read_mdf, read_tdms
 
@@ -66,6 +67,8 @@ _MAX_COLUMNS = 10_000
 """Columns of a text file: exports of whole machines have hundreds."""
 _MAX_ROWS = 100_000_000
 """Values of a column, a day at 1 kHz: each column that is used then takes 0.8 GB."""
+_VALUE_BYTES = 40.0
+"""Bytes of a value that is loaded: four columns of it as they are in the file, and as float64."""
 _MAX_WHOLE_BYTES = 128_000_000
 """Bytes of a file that is read at once, JSON and exports with remarks; Python takes ten times as many."""
 MAX_LINE_BYTES = 1 << 20
@@ -127,6 +130,7 @@ class LogFile:
         """Count the values of a column without loading it; InputError if there are too many."""
         if (count := len(self.columns[name])) > _MAX_ROWS:
             raise self.error(f"column {name!r} has {count} values; at most {_MAX_ROWS} can be read")
+        check_cost(f"{self.path}: column {name!r} of {count} values", _VALUE_BYTES * count, "cut the log into parts")
         return count
 
     def load_values(self, name: ColumnName) -> np.ndarray:

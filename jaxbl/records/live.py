@@ -252,8 +252,8 @@ class Stream:
         if block is None:
             return []
         columns, values = block
-        values, rest = values[:_BATCH_ROWS], values[_BATCH_ROWS:]
-        self._block = (columns, rest) if len(rest) else None
+        values, remaining = values[:_BATCH_ROWS], values[_BATCH_ROWS:]
+        self._block = (columns, remaining) if len(remaining) else None
         # each header has a list of its own: another file begins anew, with the same names, too
         is_new = columns is not self._columns and not (isinstance(columns, range) and columns == self._columns)
         if is_new and not self._read_columns(columns):

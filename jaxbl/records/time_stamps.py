@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.lines import DOUBT
+from jaxbl.workers import check_cost
 
 from .files import LogFile, read_log_file
 from .libraries import Column, ColumnName, read_at
@@ -22,6 +23,8 @@ SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of the stamps -> s."""
 _DOUBTFUL_PERIOD = 0.5
 """Period, s, from which the unit of the stamps is doubtful: drives are sampled much faster."""
+_ROW_BYTES, _ROW_SECONDS = 1000.0, 8e-6
+"""Bytes and seconds that reading takes for each row of four channels, on one core."""
 _SHORTEST_PERIOD, _LONGEST_PERIOD = 1e-9, 1e10
 """Possible periods, s; the longest are seconds in nanoseconds that were read as seconds."""
 
@@ -98,6 +101,13 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     stamps = stamps - start
     is_full = _find_full_rows(file, table, len(stamps))
     rows = _select_rows(file, table, stamps, is_full)
+    # the time is of correcting clocks and zeros, and of statistics
+    check_cost(
+        f"{file.path}: a log of {len(rows)} rows",
+        _ROW_BYTES * len(rows),
+        "[log] start and stop select a part of it",
+        _ROW_SECONDS * len(rows),
+    )
     intervals = np.diff(stamps[is_full])
     median = float(np.median(intervals)) or float(np.mean(intervals))
     # stamps that were rounded to more than a period come in groups

@@ -20,6 +20,7 @@ import pandas as pd
 
 from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
+from jaxbl.workers import check_cost
 
 from .costs import Operations, choose_backend, count_operations, lanes_at_once, load_costs
 from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
@@ -94,6 +95,10 @@ def layout_for(config: Config, points: Points, count: int, capacity: int) -> Lay
     return Layout(seeds, per_chunk)
 
 
+_CHUNK_BYTES = 100
+"""Bytes of a chunk in the list of all."""
+_LANE_BYTES = 200
+"""Least bytes of a lane: its numbers, state and metrics."""
 _MAX_PROGRAMS = 16
 """Number of compiled programs in memory; each group has one."""
 _TIMED_SAMPLES, _TIMED_SECONDS = 2000, 0.3
@@ -148,6 +153,7 @@ class Engine:
         self.backend: Backend = check_backend(backend) or self._choose_backend()
         self.require_backend = require_backend
         self.layout = layout or self._choose_layout(self.backend, config.sweep.chunk)
+        check_cost("a chunk", _LANE_BYTES * math.prod(self.layout), "[sweep] chunk should be smaller, or left out")
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
@@ -200,11 +206,11 @@ class Engine:
     def chunk(self, index: int) -> Chunk:
         """The chunk with an index; of a refined study, one of its coarse grid."""
         slice_count = math.ceil(self.points.coarse_size / self.layout.points)
-        group, index_in_group = divmod(index, len(self._seed_slices) * slice_count)
+        group, index_in_group = divmod(index, self._seed_slices * slice_count)
         seed_slice, point_slice = divmod(index_in_group, slice_count)
         first = point_slice * self.layout.points
         last = min(first + self.layout.points, self.points.coarse_size)
-        return Chunk(index, group, self._seed_slices[seed_slice], self.points.coarse_points(np.arange(first, last)))
+        return Chunk(index, group, self._seed_slice(seed_slice), self.points.coarse_points(np.arange(first, last)))
 
     def chunk_order(self) -> list[int]:
         """Indices of all chunks in the order in which they are computed, so that the grid is covered coarsely first.
@@ -213,7 +219,8 @@ class Engine:
         take turns if the programs of all groups can be held in memory.
         """
         slice_count = math.ceil(self.points.coarse_size / self.layout.points)
-        shape = len(self.points.groups), len(self._seed_slices), slice_count
+        shape = len(self.points.groups), self._seed_slices, slice_count
+        check_cost("the list of chunks", _CHUNK_BYTES * math.prod(shape), "[sweep] chunk should be larger, or left out")
         group, seed_slice, point_slice = np.unravel_index(np.arange(math.prod(shape)), shape)
         rank, level = _rank_coarse_first(slice_count)
         if len(self.points.groups) <= _MAX_PROGRAMS:
@@ -233,13 +240,19 @@ class Engine:
             points: indices of the points, `(points,)`.
             first_index: index of the first chunk; the others count up from it.
         """
-        pairs = itertools.product(self._seed_slices, _slice_evenly(points, self.layout.points))
+        seed_slices = map(self._seed_slice, range(self._seed_slices))
+        pairs = itertools.product(seed_slices, _slice_evenly(points, self.layout.points))
         return [Chunk(index, group, seeds, point_slice) for index, (seeds, point_slice) in enumerate(pairs, first_index)]
 
-    @functools.cached_property
-    def _seed_slices(self) -> list[np.ndarray]:
-        """All seeds, divided into those of one chunk each."""
-        return _slice_evenly(self.config.sweep.first_seed + np.arange(self.config.sweep.seeds), self.layout.seeds)
+    @property
+    def _seed_slices(self) -> int:
+        """Number of slices of the seeds, each for one chunk."""
+        return math.ceil(self.config.sweep.seeds / self.layout.seeds)
+
+    def _seed_slice(self, index: int) -> np.ndarray:
+        """Return the seeds of a slice; all of them may be more than memory holds."""
+        first, end = index * self.layout.seeds, min((index + 1) * self.layout.seeds, self.config.sweep.seeds)
+        return self.config.sweep.first_seed + np.arange(first, end)
 
     @property
     def rows(self) -> int:
@@ -313,6 +326,7 @@ class Engine:
                 require_backend=self.require_backend,
             )
             self.compile_seconds += time.perf_counter() - start
+            check_cost("a chunk", 1e6 * program.megabytes, "[sweep] chunk should be smaller, or left out")
             if program.fallback_reason is not None and program.fallback_reason not in self.fallback_reasons:
                 self.fallback_reasons.append(program.fallback_reason)
             return program

@@ -17,10 +17,14 @@ from jaxbl.fused import Unsupported, raising_unsupported, warn_of_scan
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.records import POSITION_CHANNELS
+from jaxbl.workers import check_cost
 
 from .metrics import ALL_METRICS, add_gain_metrics, identified_parameters, observer_gains
 from .programs import Backend
 from .store import identity
+
+_ROW_BYTES, _STEP_SECONDS = 600.0, 2e-7
+"""Bytes that a row of the trace takes with its copies, and least seconds of a plant step."""
 
 
 class Trial(NamedTuple):
@@ -58,6 +62,13 @@ def run(study: ConfigSource, *, seed: int = 0, every: int = 1, backend: Backend 
     config = read_config(study)
     if not 1 <= every <= config.run.steps:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
+    samples = config.run.steps
+    check_cost(
+        f"a trace of {samples // every} rows",
+        _ROW_BYTES * samples / every,
+        "--every N keeps fewer of them",
+        _STEP_SECONDS * samples * config.run.substeps,
+    )
     with precision(config):
         experiment = prepare(config)
         if backend == "scan":

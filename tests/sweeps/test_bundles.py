@@ -1,14 +1,16 @@
 """Studies on a cluster: the table that one process gives, parts that are there left out, and what goes wrong in one line."""
 
+import contextlib
 import itertools
+import socket
 import time
 from contextlib import ExitStack
-from threading import Event, Timer
+from threading import Event, Thread, Timer
 
 import jax
 import pandas as pd
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Security
 from small_study import ALPHA, LAMBDA, read_parts, spaced_axis, thirty_run_study
 
 from jaxbl import cluster
@@ -21,6 +23,7 @@ from jaxbl.sweeps.bundles import Bundle, _bundle_size, compute_bundle
 from jaxbl.sweeps.programs import Layout
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import submit, sweep
+from jaxbl.workers import subscribe
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
 
@@ -192,3 +195,72 @@ def test_a_scheduler_that_is_lost_is_said():
                 next(results)
         finally:
             _GO_ON.set()
+
+
+def listen_silently(folder):
+    server = socket.create_server(("127.0.0.1", 0))
+    return f"tcp://127.0.0.1:{server.getsockname()[1]}", server
+
+
+def listen_as_a_web_server(folder):
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def answer():
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = server.accept()
+                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+                connection.close()
+
+    Thread(target=answer, daemon=True).start()
+    return f"tcp://127.0.0.1:{server.getsockname()[1]}", server
+
+
+def write_file(text):
+    def write(folder):
+        (folder / "scheduler.json").write_text(text)
+        return str(folder / "scheduler.json"), None
+
+    return write
+
+
+WRONG_SCHEDULERS = {
+    "silent port": listen_silently,
+    "web server": listen_as_a_web_server,
+    "nobody": lambda folder: ("tcp://127.0.0.1:1", None),
+    "no file": lambda folder: (str(folder / "absent.json"), None),
+    "folder": lambda folder: ((folder / "scheduler.json").mkdir() or str(folder / "scheduler.json"), None),
+    "empty file": write_file(""),
+    "file without an address": write_file('{"id": 1}'),
+    "file of a list": write_file("[1]"),
+    "file of another kind of address": write_file('{"address": {"a": 1}}'),
+    "no address": lambda folder: ("scheduler", None),
+    "unknown protocol": lambda folder: ("gopher://127.0.0.1:1", None),
+    "too many processes": lambda folder: ("local:999", None),
+}
+
+
+@pytest.mark.parametrize("place", WRONG_SCHEDULERS.values(), ids=list(WRONG_SCHEDULERS))
+def test_a_wrong_scheduler_is_one_line_and_no_wait_without_end(place, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.5)
+    address, server = place(tmp_path)
+    said, begin = [], time.monotonic()
+    with subscribe(said.append), pytest.raises(InputError, match=r"^--scheduler ") as error, connect(address):
+        pass
+    assert "\n" not in str(error.value)
+    assert time.monotonic() - begin < 30.0
+    assert address.startswith("local:") or said == [f"waiting for the scheduler {address}"]
+    if server is not None:
+        server.close()
+
+
+def test_no_other_user_can_have_local_workers_run_code():
+    """Who knows the port, and not the keys, is refused."""
+    with connect("local:1") as workers:
+        address = workers._client.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        with pytest.raises(OSError, match=r"\w"):
+            Client(address.replace("tls", "tcp"), timeout=2.0, set_as_default=False)
+        with pytest.raises(OSError, match=r"\w"):
+            Client(address, timeout=2.0, set_as_default=False, security=Security.temporary())
+        assert list(workers.map_jobs(abs, [-1, -2])) == [1, 2]
