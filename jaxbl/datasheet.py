@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from .errors import InputError
 from .json_types import JsonObject
+from .lines import percent
 from .units import on_a_line
 
 if TYPE_CHECKING:
@@ -518,7 +519,7 @@ def _choose_amplitude(answers: Answers, waves: int) -> float:
 def describe_expectation(kind: DriveKind, pilot_metrics: JsonObject) -> str:
     """Describe in a sentence the error that the motor's observer will have, and what it is due to."""
     expected, unit = pilot_metrics["motor"]["expected"], kind.unit("motor", "rad")
-    causes = ", ".join(f"{100 * share:.2g} % {cause}" for cause, share in expected["shares"].items())
+    causes = ", ".join(f"{percent(share)} {cause}" for cause, share in expected["shares"].items())
     error = f"{expected['velocity']:.2g} {unit}/s of velocity error (rms) of the motor with the study's gains"
     worst = f"{expected['largest_velocity']:.2g} where numbers are off by {100.0 * _UNCERTAINTY:g} %"
     return f"Expect about {error}, and {worst}; shares of its square: {causes}."
@@ -575,7 +576,7 @@ def describe_obstacle(pilot_metrics: JsonObject) -> str:
     if share < _LARGE_SHARE:
         return ""
     return (
-        f"Observers may be off by {100.0 * share:.2g} % of the largest speed: the torque changes within few samples, or the "
+        f"Observers may be off by {percent(share)} of the largest speed: the torque changes within few samples, or the "
         "encoders are coarse. A shorter sample period or finer encoders help."
     )
 

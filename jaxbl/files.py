@@ -402,10 +402,14 @@ def make_folder(path: Path, remedy: str = "choose another folder with --out") ->
             (path / ".probe").unlink()
         return
     try:
+        # Parquet's library takes names in UTF-8 alone
+        str(path).encode()
         path.mkdir(parents=True, exist_ok=True)
         probe = path / f".probe.{os.getpid()}"
         probe.touch()
         probe.unlink()
+    except UnicodeEncodeError:
+        raise InputError(f"{path}: is no name in UTF-8; --out should name another folder") from None
     except FileExistsError:
         raise InputError(f"{path}: is a file; --out should name a folder") from None
     except NotADirectoryError:

@@ -25,6 +25,11 @@ def doubts_among(lines: Iterable[str]) -> Lines:
     return [line for line in lines if line.startswith(DOUBT)]
 
 
+def percent(share: float) -> str:
+    """Return a share in text, of two digits up to 10 %."""
+    return f"{100.0 * share:.2g} %" if abs(share) < 0.095 else f"{100.0 * share:.0f} %"
+
+
 class NextStep(NamedTuple):
     """A command line that a user may go on with, and the question that it answers: keys of `next` in `--json`."""
 

@@ -26,6 +26,7 @@ from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, colu
 from jaxbl.estimation.segments import segments_of, signal_sizes
 from jaxbl.estimation.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import percent
 from jaxbl.records import Record
 from jaxbl.workers import announce
 
@@ -247,7 +248,7 @@ def _summary(
     before, after = holdout["nominal_rms"] ** 2, holdout["rms"] ** 2
     sentence = (
         f"motor side: the model as given predicts it to {holdout['nominal_rms']:.2g} {unit} rms (noise {noise:.2g}); "
-        f"fitted, it leaves a torque of {left:.2g} {force} rms a sample unexplained ({100.0 * left / size:.2g} % of the "
+        f"fitted, it leaves a torque of {left:.2g} {force} rms a sample unexplained ({percent(left / size)} of the "
         f"driving torque; {allowed:.2g} {force} may be noise)"
     )
     findings = []

@@ -25,7 +25,7 @@ from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 from .free_parameters import FreeParameter, free_values, make_free_parameters
 from .identification_summary import by_regression, by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
-from .log_columns import columns_of, observer_chain
+from .log_columns import columns_of, note_damping, observer_chain
 from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
 from .regression import find_motion_share, remembers_input
@@ -147,6 +147,8 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         done()
         gains, gain_values = gains_for(task.missing, fitted, segments)
         chain, recursive = observer_chain(set_leaves(fitted, arrays(gain_values)), segments, len(record.time))
+        if damping := note_damping(fitted):
+            chain, recursive = {name: np.full_like(column, np.nan) for name, column in chain.items()}, {}
         done()
         trace = pd.DataFrame(columns_of(record, segments, fitted, search_fit) | chain)
         factor = decimation(config, record)
@@ -157,6 +159,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         done()
         summary = summary_of(task, fitted, search_fit, profiles) | {"method": method}
         summary["torque"] = torque_errors(record, fitted, parts, factor)
+        summary["notes"] = [*summary["notes"], *damping]
         if summary["rejected"]:
             mark_lacking(summary, find_motion_share(fitted, parts, factor))
         if gains:

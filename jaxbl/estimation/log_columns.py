@@ -82,6 +82,25 @@ def _replay_observers(experiment: Experiment, torque: jax.Array, measured: Trace
     return replay(experiment, torque, measured, record=keep)[1]
 
 
+_STABLE_DAMPING = 2.0
+"""Sampling periods over a side's own time constant at which its model, forward Euler, begins to diverge."""
+
+
+def note_damping(experiment: Experiment) -> list[str]:
+    """Say where observers cannot run, since friction stops a side within a sampling period; no sentence if they can."""
+    period = float(experiment.run.sample_period)
+    ratios = {
+        side: float(experiment.drive.viscous(side)) * period / float(experiment.drive.inertia(side))  # type: ignore[attr-defined]
+        for side in experiment.sides
+    }
+    return [
+        f"The observers cannot run at this period: the {side}'s viscous friction times {1e3 * period:.4g} ms over its "
+        f"inertia is {ratio:.3g}; below {_STABLE_DAMPING:g} they can, at a shorter period."
+        for side, ratio in ratios.items()
+        if ratio >= _STABLE_DAMPING
+    ]
+
+
 def observer_chain(experiment: Experiment, segments: Sequence[Segment], samples: int) -> tuple[NamedArrays, JsonObject]:
     """The paper's chain on the longest segment: observers, and the recursive identifier on their equivalent control.
 

@@ -16,6 +16,7 @@ from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import percent
 from jaxbl.records import POSITION_CHANNELS, Record
 
 from .free_parameters import FreeParameter
@@ -119,7 +120,7 @@ def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     if left <= max(_FACTOR * model.torque_noise, _LEFT * size):
         return ""
     return (
-        f"a torque of {left:.2g} {record.unit_of('motor.torque', 'N m')} rms ({100.0 * left / size:.2g} % of the driving "
+        f"a torque of {left:.2g} {record.unit_of('motor.torque', 'N m')} rms ({percent(left / size)} of the driving "
         "torque) is left unexplained; the model lacks something else, or its nominal numbers are too far off"
     )
 

@@ -21,6 +21,7 @@ from jaxbl.config import Config, FigureTable
 from jaxbl.config.figures import check_selection, filter_rows, resolve_where
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import percent
 from jaxbl.sweeps.sweep import StudyResult
 
 NOISE, PERIOD = "encoders.noise", "run.sample_period"
@@ -343,7 +344,7 @@ class _FigureLine:
         if y <= _RESOLUTION_FACTOR * factor * self._resolution[i]:
             return f"float resolution: the error is {_format_times(y / self._resolution[i])} the rounding of a reading"
         if y >= signal_size / (_SIGNAL_FACTOR * factor):
-            return f"saturation: the error is {100.0 * y / signal_size:.2g} % of the signal"
+            return f"saturation: the error is {percent(y / signal_size)} of the signal"
         if self._figure.x == NOISE and y <= _FLOOR_FACTOR * factor * noiseless_error:
             return f"sampling period: the error is {_format_times(y / noiseless_error)} that without noise, its floor"
         noise_factor = _FLOOR_FACTOR if must_dominate else 1.1
@@ -356,7 +357,7 @@ class _FigureLine:
         if exponent > _PERIOD_EXPONENT:
             return f"sampling period: the error grows with it as h^{exponent:.2f}, as under averaged white noise"
         if velocity_error >= 1.0 / (_SIGNAL_FACTOR * factor):
-            return f"saturation: the velocity error is {100.0 * velocity_error:.2g} % of the velocity"
+            return f"saturation: the velocity error is {percent(velocity_error)} of the velocity"
         return None
 
     def explain_ends(self, fit: PowerLawFit | None) -> dict[str, str]:

@@ -20,6 +20,7 @@ from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, TuneTable, with_values
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import percent
 from jaxbl.observer import OBSERVERS, OperatingConditions
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points, draw_sobol
@@ -461,7 +462,7 @@ def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[s
             lines.append(f"{side}: best values at an end of the range searched: {gains}. Beyond it may be better ones.")
         if unfinished:
             kind_list = ", ".join(
-                f"{kind} ({f'{n} {share}, ' if share else ''}{100 * most:.2g} %)" for kind, (n, most) in unfinished.items()
+                f"{kind} ({f'{n} {share}, ' if share else ''}{percent(most)})" for kind, (n, most) in unfinished.items()
             )
             lines.append(
                 f"{side}: the last zoom still made errors smaller by more than {100 * _UNFINISHED_SHARE:g} %: {kind_list}. "

@@ -67,6 +67,8 @@ _MAX_COLUMNS = 10_000
 """Columns of a text file: exports of whole machines have hundreds."""
 _MAX_ROWS = 100_000_000
 """Values of a column, a day at 1 kHz: each column that is used then takes 0.8 GB."""
+_EXACT = 2**53
+"""Whole numbers above it are rounded as float64: stamps in ns since 1970 to 256 ns."""
 _VALUE_BYTES = 40.0
 """Bytes of a value that is loaded: four columns of it as they are in the file, and as float64."""
 _MAX_WHOLE_BYTES = 128_000_000
@@ -151,6 +153,10 @@ class LogFile:
             texts = pd.Series(stamps).astype(str).str.replace(",", ".")
             if pd.to_numeric(texts, errors="coerce").isna().all() and texts.str.contains(r"\d[:/-]\d").any():
                 stamps = pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).dt.tz_convert(None).to_numpy()
+        if stamps.dtype.kind in "iu" and len(stamps) and np.abs(stamps.astype(float)).max() > _EXACT:
+            self.notes.append(f"Time is counted from {stamps[0]} in column {name!r}.")
+            # as signed differences: these are exact, and may go back
+            return (stamps - stamps[0]).astype(np.int64) * unit
         if stamps.dtype.kind not in "Mm":
             return self.load_numbers(column, channel) * unit
         if unit != 1.0:
@@ -651,13 +657,17 @@ def _check_names(cells: list[str]) -> list[str]:
 
 def _read_json(text: str) -> Columns:
     """Read an array of objects or of rows of numbers, an object that holds one, objects line by line, or arrays by name."""
+    # NumPy has no whole numbers of more digits than stamps in ns, and Python reads none of thousands
+    load = partial(
+        json.loads, parse_int=lambda digits: (int if len(digits) < 20 else float)(digits), object_pairs_hook=_name_members
+    )
     try:
-        content = json.loads(text)
+        content = load(text)
     except RecursionError:
         raise InputError("is nested too deep; a log holds rows, or arrays by name") from None
     except ValueError as error:
         try:
-            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+            content = [load(line) for line in text.splitlines() if line.strip()]
         except (RecursionError, ValueError):
             raise InputError(f"is not valid JSON: {error}") from None
     if isinstance(content, dict):
@@ -673,6 +683,15 @@ def _read_json(text: str) -> Columns:
     else:
         raise InputError("should hold an array of objects, one a row, or of rows of equally many numbers")
     return _require_columns(columns)
+
+
+def _name_members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        names = [name for name, _ in pairs]
+        duplicate = next(name for i, name in enumerate(names) if name in names[:i])
+        raise InputError(f"two members of an object are called '{duplicate}'; names should differ")
+    return members
 
 
 def _is_matrix(value: Any) -> bool:
@@ -800,7 +819,8 @@ def _read_hdf5(path: Path) -> Columns:
         return node.visititems_links(add_member)
 
     def add_dataset(name: str, node: Any) -> None:
-        if isinstance(node, h5py.Group) or name.startswith("#"):
+        # some programs write a dataset without a value for an option that is not set
+        if isinstance(node, h5py.Group) or name.startswith("#") or node.shape is None:
             return
         matlab_class = node.attrs.get("MATLAB_class", b"").decode()
         if node.is_virtual or node.external:

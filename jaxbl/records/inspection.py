@@ -8,6 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxbl.lines import percent
+
 from .alignment import NominalDrive
 from .element import SIZE_NAMES, Element, RigLog, fit_element
 from .gearing import Gearing, twist_noise
@@ -286,7 +288,7 @@ def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio
     if gearing is None or ratio is None:
         return _judge_alike(names, "no", "the motion does not exceed the noise")
     share = min(gearing.twist, gearing.least_twist) / gearing.motion
-    remark = f"{100 * gearing.residual:.2g} % of theta_e is not explained"
+    remark = f"{percent(gearing.residual)} of theta_e is not explained"
     if gearing.is_loose:
         remark = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
     noise = twist_noise(ratio, channels["theta_e"], channels["theta_s"])

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from jaxbl.lines import DOUBT
+from jaxbl.lines import DOUBT, percent
 
 from .alignment import NominalDrive
 from .channels import RawChannel
@@ -339,7 +339,7 @@ def note_channel_faults(file: LogFile, name: str, statistics: ChannelStatistics,
             "dropped counts or disturbed readings."
         )
     if statistics.saturated:
-        file.notes.append(f"{name} is saturated in {100 * statistics.saturated:.2g} % of the samples.")
+        file.notes.append(f"{name} is saturated in {percent(statistics.saturated)} of the samples.")
     # 1e4 rad/s, about 100 000 rpm, is beyond drives
     if statistics.unit == "rad" and rate > 1e4:
         rpm = rate * 30.0 / math.pi

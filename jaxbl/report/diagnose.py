@@ -9,12 +9,12 @@ import numpy as np
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import DOUBT, Lines
+from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_table, percent, write_fit
+from .numbers import lead_with_doubt, number_table, write_fit
 from .panels import (
     BLUE,
     FAINT,

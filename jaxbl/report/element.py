@@ -6,11 +6,11 @@ import tomli_w
 
 from jaxbl.estimation.element import ElementIdentification
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines
+from jaxbl.lines import Lines, percent
 from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
-from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write_fit
 from .panels import BLUE, ORANGE, Axis, Figure, Line, Panel, Part, Span, cloud, join, missing_quantity, stack
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from jaxbl.estimation.identify import Identification
 from jaxbl.estimation.search import is_noise
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import DOUBT, Lines
+from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .numbers import lead_with_doubt, number_figures, number_table, percent, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write_fit
 from .panels import SIDES
 
 

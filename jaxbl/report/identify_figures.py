@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.identify import Identification
+from jaxbl.lines import percent
 from jaxbl.quantity import Quantity
 
 from .log_signals import LogSignals
 from .motor_alone_figures import draw_motor_alone
-from .numbers import percent
 from .panels import (
     BLACK,
     BLUE,

@@ -6,13 +6,14 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import to_jsonable, write_json
+from jaxbl.lines import percent
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectrum
 from jaxbl.records.time_stamps import GAP_PERIODS
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .numbers import lead_with_doubt, percent
+from .numbers import lead_with_doubt
 from .panels import (
     BLACK,
     BLUE,

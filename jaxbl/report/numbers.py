@@ -35,11 +35,6 @@ def number_table(heading: str, numbers: Mapping[str, Quantity]) -> ResultTable:
     return ResultTable(heading, list(table), to_jsonable(table.to_numpy()))
 
 
-def percent(share: float) -> str:
-    """A share in text, of two digits up to 10 %."""
-    return f"{100.0 * share:.2g} %" if abs(share) < 0.095 else f"{100.0 * share:.0f} %"
-
-
 def lead_with_doubt(result: Result) -> Result:
     """Return a result whose answer is the remark that puts all others in doubt, if there is one."""
     doubts = doubts_among(result.remarks)

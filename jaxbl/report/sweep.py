@@ -16,7 +16,7 @@ from jaxbl.config import Config
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
-from jaxbl.lines import Lines
+from jaxbl.lines import Lines, percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
 from jaxbl.sweeps.metrics import SIDE_METRICS
@@ -25,7 +25,6 @@ from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Distinct, Groups, Rows, spread
 from .maps import best_gains, laws_of, slope_text, unit_of, worst_runs
-from .numbers import percent
 from .panels import SIDES
 
 

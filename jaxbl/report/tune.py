@@ -11,14 +11,14 @@ from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, doubts_among
+from jaxbl.lines import Lines, doubts_among, percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .certificate import certificate_lines, certificate_tables, draw_certificates, is_refuted, write_certificates
 from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usual_rule_curve
 from .maps import cell_edges, colour_scale, flat_remark
-from .numbers import lead_with_doubt, percent
+from .numbers import lead_with_doubt
 from .panels import (
     BLUE,
     GREEN,

@@ -101,8 +101,8 @@ _LANE_BYTES = 200
 """Least bytes of a lane: its numbers, state and metrics."""
 _MAX_PROGRAMS = 16
 """Number of compiled programs in memory; each group has one."""
-_TIMED_SAMPLES, _TIMED_SECONDS = 2000, 0.3
-"""Least length of the short runs that an estimate is made from."""
+_TIMED_SAMPLES, _TIMED_SECONDS = 100, 0.5
+"""Least length of the short runs that an estimate is made from; of large chunks 2000 samples take minutes."""
 _COUNTED_GROUPS = 24
 """Largest number of groups whose operations an estimate counts."""
 

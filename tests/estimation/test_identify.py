@@ -380,3 +380,34 @@ def test_the_least_lambda_of_the_gains_that_are_tried_is_that_of_the_condition()
     alpha, bound = 7.3 * observer_gains._ALPHA, 7.3
     least = least_lambda_exact(jnp.asarray(alpha), jnp.full(len(alpha), bound))
     np.testing.assert_allclose(np.sqrt(bound) * observer_gains._LEAST_LAMBDA, least, rtol=1e-13)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.2, 2.5, 4.0])
+def test_a_drive_that_friction_stops_within_a_period_gives_numbers(ratio, tmp_path):
+    """Geared servos at 50 to 100 Hz: nothing overflows, and one line says that observers cannot run."""
+    inertia, period, count = 1e-3, 0.01, 1500
+    viscous = ratio * inertia / period
+    rng = np.random.default_rng(int(10 * ratio))
+    time = np.arange(count) * period
+    u = sum(np.sin(2.0 * np.pi * f * time + rng.uniform(0.0, 6.0)) for f in (0.4, 1.3, 3.1, 7.7, 14.0))
+    # exactly, with the input held over each period
+    decay = np.exp(-ratio)
+    velocity, position = np.zeros(count), np.zeros(count)
+    for k in range(count - 1):
+        final = u[k] / viscous
+        velocity[k + 1] = final + (velocity[k] - final) * decay
+        position[k + 1] = position[k] + final * period + (velocity[k] - final) * (1.0 - decay) * inertia / viscous
+    log = pd.DataFrame({"t": time, "u": u, "theta_e": position + 2e-5 * rng.normal(size=count)})
+    log.to_csv(tmp_path / "log.csv", index=False)
+    model = {
+        "drive": {"kind": "rigid", "motor_inertia": 1.2 * inertia, "motor_viscous": 0.9 * viscous},
+        "uncertainty": {"relative": 0.3},
+        "run": {"substeps": 20},
+        "log": {"absent": ["theta_s"]},
+    }
+    summary = identify(tmp_path / "log.csv", model).summary
+    numbers = {name: number["value"] for name, number in summary["parameters"].items()}
+    assert numbers["drive.motor_viscous"] == pytest.approx(viscous, rel=0.01)
+    assert numbers["drive.motor_inertia"] == pytest.approx(inertia, rel=0.03)
+    lines = [note for note in summary["notes"] if "observers cannot run at this period" in note]
+    assert len(lines) == (ratio >= 2.0)

@@ -649,3 +649,69 @@ def test_a_wrong_cell_beside_decimal_commas_is_named(tmp_path):
     (tmp_path / "log.csv").write_text("t;u\n1;1,5\n2;off\n3;2,5\n")
     with pytest.raises(InputError, match="column 'u', data row 2 is 'off'"):
         read_log_file(tmp_path / "log.csv").load_numbers("u")
+
+
+LONG = "1" + "0" * 400
+
+
+def json_log(**members):
+    """An object of vectors as JSON; text in place of a vector stands as it is."""
+    vectors = {"t": T.tolist(), "u": U.tolist()} | members
+    return "{" + ", ".join(f'"{name}": {values}' for name, values in vectors.items()) + "}"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (json_log(u=f"[1, {LONG}, 3, 4, 5]"), "data row 2 is inf"),
+        (json_log(u=f"[1, {'7' * 5000}, 3, 4, 5]"), "data row 2 is inf"),
+        (json_log(u=f"[1, -{LONG}, 3, 4, 5]"), "data row 2 is -inf"),
+        (f"[[0, 1], [1, {LONG}], [2, 3]]", "data row 2 is inf"),
+        (f'[{{"t": 0, "u": 1}}, {{"t": 1, "u": {LONG}}}]', "data row 2 is inf"),
+        (json_log(u="[1, 36893488147419103232, 3, 4, 5]"), ""),
+        (json_log()[:-1] + ', "u": [1, 2, 3, 4, 5]}', "two members of an object are called 'u'"),
+        ('[{"t": 0, "u": 1, "u": 2}, {"t": 1, "u": 2, "u": 3}]', "two members of an object are called 'u'"),
+        ('{"t": 0, "u": 1, "t": 2}\n{"t": 1, "u": 2, "t": 3}', "two members of an object are called 't'"),
+        ('{"axis": {"u": [1, 2], "u": [1, 2]}}', "two members of an object are called 'u'"),
+        ('[{"a": {"b": 1, "b": 2}}]', "two members of an object are called 'b'"),
+    ],
+)
+def test_numbers_of_any_length_and_double_names_in_json(text, fault, tmp_path):
+    """A whole number beyond all floats is no finite number, and two values of one name are not chosen from."""
+    (tmp_path / "log.json").write_text(text)
+
+    def load():
+        log = read_log_file(tmp_path / "log.json")
+        return log.load_numbers(list(log.columns)[-1])
+
+    if not fault:
+        assert load()[1] == 2.0**65
+        return
+    with pytest.raises(InputError, match=fault) as error:
+        load()
+    assert len(str(error.value)) < 500
+
+
+@pytest.mark.parametrize("kind", ["f", "i8", "S4", "u1"])
+def test_datasets_without_a_value_are_left_out(kind, tmp_path):
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["t"], file["u"], file["option"] = T, U, h5py.Empty(kind)
+        file.create_group("deeper")["option"] = h5py.Empty(kind)
+    assert list(read_log_file(tmp_path / "log.h5").columns) == ["t", "u"]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "json"])
+@pytest.mark.parametrize("unit", [1, 1000])
+def test_stamps_since_1970_keep_their_nanoseconds(kind, unit, tmp_path):
+    """As float64 they would be rounded to 256 ns, a thirtieth of this period."""
+    stamps = 1_700_000_000_123_456_789 + 7_919 * np.arange(50)
+    frame = pd.DataFrame({"t": stamps // unit, "u": np.zeros(50)})
+    path = tmp_path / f"log.{kind}"
+    frame.to_parquet(path) if kind == "parquet" else path.write_text(
+        frame.to_csv(index=False) if kind == "csv" else json.dumps(frame.to_dict("list"))
+    )
+    log = read_log_file(path)
+    seconds = log.load_seconds("t", unit * 1e-9)
+    exact = (stamps // unit - stamps[0] // unit) * unit
+    tolerance = 1e-12 if unit == 1 else 1e-6
+    np.testing.assert_allclose(seconds - seconds[0], 1e-9 * exact, rtol=0.0, atol=tolerance)
