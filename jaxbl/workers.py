@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from .errors import InputError, NoResult, escape_unprintable
+from .lines import format_duration
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -32,7 +33,6 @@ _PROCESS_MEMORY = 5 * 2**30
 """Bytes for each process: after twenty logs of many lengths one held 4.7e9."""
 _LONG = 10.0
 """Seconds from which on it is said beforehand how long a task takes."""
-_UNITS = {"days": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 _MAPPING_LIMIT = 30_000
 """Memory mappings of a process: half of what Linux allows by default."""
 
@@ -95,8 +95,7 @@ def check_cost(task: str, memory: float, remedy: str, seconds: float = 0.0) -> N
     if memory > (available := count_memory()):
         raise InputError(f"{task} takes {memory / 1e9:.3g} GB of memory; here are {available / 1e9:.3g} GB; {remedy}")
     if seconds > _LONG:
-        unit, count = next((unit, seconds / size) for unit, size in _UNITS.items() if seconds >= size)
-        announce(f"{task}: takes about {count:.2g} {unit}")
+        announce(f"{task}: takes about {format_duration(seconds)}")
 
 
 def useful_processes(jobs: int) -> int:

@@ -1,9 +1,10 @@
 """Commands on measured logs: inspect, identify, diagnose, watch."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +13,7 @@ from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.files import ResultFolder, log_subject, open_results, run_or_read, to_jsonable, write_atomic
 from jaxbl.json_types import JsonObject
+from jaxbl.lines import NextStep
 from jaxbl.result import KeyFigure
 from jaxbl.terminal import STEPS, is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
@@ -35,6 +37,7 @@ from .options import (
 from .outcome import Outcome
 
 if TYPE_CHECKING:
+    from jaxbl.estimation.logs import LogTask
     from jaxbl.monitoring.watch import Watch, WatchTask
     from jaxbl.result import Result
 
@@ -133,31 +136,13 @@ def identify(
     from jaxbl.report.identify import describe_identification
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
-    check_doubts(filter(None, (task.record, task.holdout)), force)
     if next_experiment is not None:
         from jaxbl.diagnosis.next_experiment import check_gap_sought
 
         check_gap_sought(task)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
-
-    def describe(summary: JsonObject) -> "Result":
-        return replace(describe_identification(summary), next_steps=after_identification(task, summary, log_call))
-
-    with run_with_progress(context, model, folder, unit=STEPS) as progress:
-        summary = run_or_read(
-            task,
-            folder / "identification.json",
-            lambda task: run_identification(task, progress),
-            lambda result, folder: jaxbl.write_report(result, folder, describe(result.summary)),
-            overwrite=overwrite,
-        )
-    card = describe(summary)
-    if next_experiment is not None:
-        from jaxbl.diagnosis.next_experiment import write_gap_experiment
-
-        written = write_gap_experiment(folder, summary, task.record, next_experiment, max_torque, max_travel)
-        card = replace(card, key_figures=[KeyFigure("next experiment", written), *card.key_figures[:3]])
-    return Outcome(card, folder, summary=summary)
+    reports = describe_identification, after_identification
+    return _run_task(context, task, log_call, "identification.json", run_identification, *reports)
 
 
 def diagnose(
@@ -213,27 +198,41 @@ def diagnose(
     from jaxbl.report.diagnose import describe_diagnosis
 
     task = read_diagnosis_task(log, model, holdout=holdout)
-    check_doubts(filter(None, (task.record, task.holdout)), force)
     folder = folder_of(log[0], "diagnosed", out)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
+    return _run_task(context, task, log_call, "diagnosis.json", run_diagnosis, describe_diagnosis, after_diagnosis)
 
-    def describe(summary: JsonObject) -> "Result":
-        return replace(describe_diagnosis(summary), next_steps=after_diagnosis(task, summary, log_call))
 
-    with run_with_progress(context, model, folder, unit=STEPS) as progress:
+def _run_task(
+    context: typer.Context,
+    task: "LogTask",
+    log_call: LogCall,
+    file: str,
+    run: Callable[..., Any],
+    describe: Callable[[JsonObject], "Result"],
+    steps: Callable[..., list[NextStep]],
+) -> Outcome:
+    """Search what a log says of a machine, unless that is done, and write the next experiment that is asked for."""
+    options, folder, experiment = context.params, log_call.folder, log_call.next_experiment
+    check_doubts(filter(None, (task.record, task.holdout)), options["force"])
+
+    def answer(summary: JsonObject) -> "Result":
+        return replace(describe(summary), next_steps=steps(task, summary, log_call))
+
+    with run_with_progress(context, log_call.model, folder, unit=STEPS) as progress:
         summary = run_or_read(
             task,
-            folder / "diagnosis.json",
-            lambda task: run_diagnosis(task, progress),
-            lambda result, folder: jaxbl.write_report(result, folder, describe(result.summary)),
-            overwrite=overwrite,
+            folder / file,
+            lambda task: run(task, progress),
+            lambda result, folder: jaxbl.write_report(result, folder, answer(result.summary)),
+            overwrite=options["overwrite"],
         )
-    card = describe(summary)
-    if next_experiment is not None:
+    card = answer(summary)
+    if experiment is not None:
         from jaxbl.diagnosis.next_experiment import write_gap_experiment, write_next_experiment
 
         write = write_gap_experiment if "backlash" in summary else write_next_experiment
-        written = write(folder, summary, task.record, next_experiment, max_torque, max_travel)
+        written = write(folder, summary, task.record, experiment, options["max_torque"], options["max_travel"])
         card = replace(card, key_figures=[KeyFigure("next experiment", written), *card.key_figures[:3]])
     return Outcome(card, folder, summary=summary)
 

@@ -65,9 +65,7 @@ _CHUNK_ROWS = 100_000
 """Rows of text that are in memory with all their columns."""
 _MAX_COLUMNS = 10_000
 """Columns of a text file: exports of whole machines have hundreds."""
-_MAX_ROWS = 100_000_000
-"""Values of a column, a day at 1 kHz: each column that is used then takes 0.8 GB."""
-_EXACT = 2**53
+_NANOSECOND, _EXACT = 1e-9, 2**53
 """Whole numbers above it are rounded as float64: stamps in ns since 1970 to 256 ns."""
 _VALUE_BYTES = 40.0
 """Bytes of a value that is loaded: four columns of it as they are in the file, and as float64."""
@@ -130,8 +128,7 @@ class LogFile:
 
     def count_values(self, name: ColumnName) -> int:
         """Count the values of a column without loading it; InputError if there are too many."""
-        if (count := len(self.columns[name])) > _MAX_ROWS:
-            raise self.error(f"column {name!r} has {count} values; at most {_MAX_ROWS} can be read")
+        count = len(self.columns[name])
         check_cost(f"{self.path}: column {name!r} of {count} values", _VALUE_BYTES * count, "cut the log into parts")
         return count
 
@@ -153,10 +150,8 @@ class LogFile:
             texts = pd.Series(stamps).astype(str).str.replace(",", ".")
             if pd.to_numeric(texts, errors="coerce").isna().all() and texts.str.contains(r"\d[:/-]\d").any():
                 stamps = pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).dt.tz_convert(None).to_numpy()
-        if stamps.dtype.kind in "iu" and len(stamps) and np.abs(stamps.astype(float)).max() > _EXACT:
-            self.notes.append(f"Time is counted from {stamps[0]} in column {name!r}.")
-            # as signed differences: these are exact, and may go back
-            return (stamps - stamps[0]).astype(np.int64) * unit
+        if stamps.dtype.kind in "iu" and unit == _NANOSECOND and len(stamps) and stamps.max() > _EXACT:
+            stamps, unit = stamps.astype("M8[ns]"), 1.0
         if stamps.dtype.kind not in "Mm":
             return self.load_numbers(column, channel) * unit
         if unit != 1.0:
@@ -485,7 +480,7 @@ class TextFormat(NamedTuple):
         cells = _split_cells(line.partition("#")[0], self.separator)
         if len(cells) != self.count:
             return None
-        return [_parse_number(cell if self.decimal == "." else cell.replace(",", ".")) for cell in cells]
+        return [_parse_number(cell.replace(self.thousands or "", "").replace(self.decimal, ".")) for cell in cells]
 
 
 def _parse_number(cell: str) -> float:
@@ -783,7 +778,7 @@ def _list_matlab_variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]
 def _add_vectors(columns: Columns, name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
     """Add a vector, or the columns of a matrix, whose values `load` returns; lengths of 1 in `shape` do not count."""
     shape = tuple(length for length in shape if length != 1)
-    if len(shape) == 2 and (min(shape) > _MAX_COLUMNS or math.prod(shape) > _MAX_ROWS):
+    if len(shape) == 2 and min(shape) > _MAX_COLUMNS:
         return
     if len(shape) == 1:
         columns[name] = Column(lambda: np.squeeze(load()), shape[0])
