@@ -17,6 +17,8 @@ from .reference_log import Errors
 
 LEAST_CHANCE = 0.01
 """Alternatives of a lower probability are not listed."""
+_SURELY = 50.0
+"""Nats beyond which odds are no other."""
 
 
 class Finding(NamedTuple):
@@ -41,14 +43,16 @@ def weigh(explanation: Explanation) -> tuple[Finding, ...]:
 
 
 def _weigh(explanation: Explanation, name: str) -> Finding:
-    fitted = explanation.fitted
+    fitted, gain = explanation.fitted, explanation.gains[name]
     odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
     if (plain := special_case(fitted, name)) is not None:
         # as likely by the fit
         odds[plain] = 1.0
-    total = 1.0 + sum(odds.values())
+    # what is still unknown may stand in its place: it gains as much
+    unknown = float(np.exp(min(explanation.largest_gain - gain.nats, _SURELY)))
+    total = 1.0 + sum(odds.values()) + unknown
     # no surer than that its torque is not zero, nor than that it makes the model better by blocks
-    least = min(_certainty(fitted, name), float(ndtr(explanation.gains[name].standard_errors)))
+    least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
     weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
     alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
     return Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives)

@@ -224,8 +224,12 @@ def _share(value: float | None) -> str:
 
 
 def _names(summary: JsonObject) -> str:
-    """Names of the effects that were found, as in a sentence."""
-    return _listed([finding["effect"] for finding in summary["findings"]])
+    """Names of the effects that were found, as in a sentence; what may as well be something unknown is there perhaps."""
+    names = []
+    for finding in summary["findings"]:
+        known = finding["confidence"] + sum(other["confidence"] for other in finding["alternatives"])
+        names.append(finding["effect"] if known > 0.5 else f"perhaps {finding['effect']}")
+    return _listed(sorted(names, key=lambda name: name.startswith("perhaps ")))
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -14,8 +14,8 @@ from jaxbl.drive import make_effect
 NAME, RIVAL = "motor.coulomb_friction", "motor.viscous_friction"
 
 
-def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, **numbers):
-    """Return the finding; `rival`: what it gains over another effect."""
+def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, **numbers):
+    """Return the finding; `rival`: what it gains over another effect; `unknown`: nats that a free function still gains."""
     effect = make_effect(name, torque=0.1, **numbers)
     fitted = SimpleNamespace(
         names=(name,),
@@ -24,7 +24,7 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, **numbers):
         errors=lambda: {f"effects.{name}.torque": error} | {f"effects.{name}.{leaf}": 0.1 * error for leaf in numbers},
     )
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
-    (finding,) = weigh(Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {}))  # type: ignore[arg-type]
+    (finding,) = weigh(Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {"motor.time": (unknown, 0.1)}))  # type: ignore[arg-type]
     return finding
 
 
@@ -57,6 +57,14 @@ def test_what_the_fit_says_counts_only_if_blocks_agree():
     assert finding.confidence + finding.alternatives[0][1] == pytest.approx(1.0)
     # blocks of one log are no other data than its own fit: a better fit counts once
     assert weigh_effect((1.0, 9.0)).confidence == pytest.approx(1.0 / (1.0 + np.exp(-1.0)))
+
+
+def test_an_effect_is_no_surer_than_what_is_unknown_leaves():
+    # it gains 50 nats; what is unknown, and gains as much, may stand in its place
+    assert weigh_effect(unknown=40.0).confidence == pytest.approx(1.0, abs=1e-4)
+    assert weigh_effect(unknown=50.0).confidence == pytest.approx(0.5)
+    finding = weigh_effect((50.0, 0.0), unknown=1000.0)
+    assert finding.confidence < 1e-6 and finding.alternatives == ()
 
 
 def test_the_explained_share_is_that_of_the_torques_power_beyond_noise():

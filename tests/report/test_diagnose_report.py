@@ -140,6 +140,18 @@ def test_numbers_that_are_further_off_come_first():
     assert describe_diagnosis(off).headline.endswith(describe_diagnosis(SUMMARY).headline)
 
 
+def test_an_effect_that_may_as_well_be_something_unknown_is_there_perhaps():
+    (sure,) = SUMMARY["findings"]
+    unsure = sure | {"effect": "motor.cogging", "confidence": 0.0, "alternatives": []}
+    tied = sure | {
+        "effect": "load.gravity",
+        "confidence": 0.5,
+        "alternatives": [{"effect": "motor.cogging", "confidence": 0.5}],
+    }
+    headline = describe_diagnosis(change_summary(findings=[unsure, sure, tied])).headline
+    assert headline.startswith("The model lacks load.coulomb_friction, load.gravity and perhaps motor.cogging; with them,")
+
+
 def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
     def describe_part(share=0.83, **test):
         gap = SUMMARY["gap"] | {"test": SUMMARY["gap"]["test"] | test}
