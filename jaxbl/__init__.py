@@ -17,6 +17,17 @@ if TYPE_CHECKING:
         step as step,
     )
     from .config import Config as Config, read_config as read_config
+    from .control import (
+        AbstractController as AbstractController,
+        AbstractReference as AbstractReference,
+        Cascade as Cascade,
+        ControllerState as ControllerState,
+        Moves as Moves,
+        Ramp as Ramp,
+        SineReference as SineReference,
+        StateFeedback as StateFeedback,
+        StepsReference as StepsReference,
+    )
     from .diagnosis.diagnose import Diagnosis as Diagnosis, diagnose as diagnose
     from .drive import (
         AbstractDrive as AbstractDrive,
@@ -93,6 +104,9 @@ if TYPE_CHECKING:
 _NAMES = {
     "chain": "Experiment Run Sample Signals State initial_state step",
     "config": "Config read_config",
+    "control": (
+        "AbstractController AbstractReference Cascade ControllerState Moves Ramp SineReference StateFeedback StepsReference"
+    ),
     "diagnosis.diagnose": "Diagnosis diagnose",
     "drive": "AbstractDrive DeadZone Encoders Initial LinearShaft Rigid SigmoidBacklash TwoInertia",
     "drive.excitation": "Chirp Multisine Prbs Recorded Sine Steps",

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .control import AbstractController, AbstractReference, ControllerState, Feedback, Target
 from .drive.effects import AbstractEffect
 from .drive.encoders import Encoders
-from .drive.excitation import AbstractExcitation
+from .drive.excitation import Sine
 from .drive.parameters import Scalar, option, parameter
 from .drive.plant import AbstractDrive, Initial, Plant, PlantState
 from .drive.transmission import AbstractTransmission
@@ -61,12 +62,14 @@ class Experiment(eqx.Module):
     transmission: AbstractTransmission | None = None
     effects: tuple[AbstractEffect, ...] = ()
     initial: Initial = Initial()
-    excitation: AbstractExcitation | Callable[[Any], Any]
+    excitation: Callable[[Any], Any] = Sine(0.0, 1.0)
     encoders: Encoders = Encoders()
     observer: Observers
     equivalent_control: EquivalentControl = EquivalentControl()
     identifier: Identifier | None = None
     run: Run = Run()
+    controller: AbstractController | None = None
+    reference: AbstractReference | None = None
 
     @property
     def plant(self) -> Plant:
@@ -91,12 +94,14 @@ class State(eqx.Module):
         observer: by side.
         equivalent_control: filtered equivalent control of each side, rad/s^2.
         identifier: None if the experiment has no identifier, or no transmission.
+        controller: None if the experiment has none.
     """
 
     plant: PlantState | None
     observer: dict[str, ObserverState]
     equivalent_control: dict[str, Number]
     identifier: IdentifierState | None
+    controller: ControllerState | None = eqx.field(default=None, kw_only=True)
 
 
 class Sample(NamedTuple):
@@ -105,7 +110,7 @@ class Sample(NamedTuple):
     Attributes:
         time: s.
         noise: one draw of a standard normal distribution for the encoder of each side.
-        input: torque, N m; in a simulation it replaces the excitation, if there is one.
+        input: torque, N m; in a simulation it replaces excitation and controller.
         measured: position of each side, rad.
         added_accelerations: by side, rad/s^2; the observers add them to the nominal ones, held until the next sample.
     """
@@ -163,6 +168,7 @@ class Signals(NamedTuple):
         torque: transmitted torque C, N m; on a rigid drive, all that resists beyond the nominal model. None in a replay.
         motor, load: signals of the sides; `load` is None on a rigid drive.
         further: signals of further sides that a drive of one's own has, by side.
+        target: of the controlled side; None without a controller.
     """
 
     time: Number
@@ -172,6 +178,7 @@ class Signals(NamedTuple):
     motor: SideSignals
     load: SideSignals | None
     further: dict[str, SideSignals] = {}  # noqa: RUF012
+    target: Target | None = None
 
     def side(self, side: str) -> SideSignals:
         return self.further[side] if side in self.further else getattr(self, side)
@@ -195,7 +202,10 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     identifier = None
     if experiment.identifier is not None and experiment.transmission is not None:
         identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
-    return State(plant, observer_states, zeros, identifier)
+    controller = None
+    if experiment.controller is not None:
+        controller = experiment.controller.start({side: zero + position[side] for side in experiment.sides})
+    return State(plant, observer_states, zeros, identifier, controller=controller)
 
 
 def initial_observer_state(experiment: Experiment, side: str, position: Scalar, velocity: Scalar) -> ObserverState:
@@ -219,7 +229,10 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     """
     drive, plant, period = experiment.drive, experiment.plant, experiment.run.sample_period
     before: Any = state.plant  # None in a replay
-    torque_in: Any = experiment.excitation(sample.time) if sample.input is None else sample.input
+    torque_in: Any = sample.input
+    if torque_in is None:
+        torque_in = experiment.excitation(sample.time)
+        torque_in = torque_in if state.controller is None else torque_in + state.controller.torque
     if sample.noise is None:
         measured, after = sample.measured or {}, None
     else:
@@ -276,8 +289,15 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
     elif after is not None:
         missing = drive.acceleration("motor", before.velocity["motor"], torque_in) - sides["motor"].true.acceleration
         torque = drive.inertia("motor") * missing
-    return State(after, observers, filtered, identifier), Signals(
-        sample.time, torque_in, twist, torque, sides.pop("motor"), sides.pop("load", None), sides
+    control, target = state.controller, None
+    if experiment.controller is not None and experiment.reference is not None and control is not None:
+        target = experiment.reference.target(sample.time)
+        position = {side: sides[side].position_estimate for side in drive.sides}
+        velocity = {side: sides[side].velocity_estimate for side in drive.sides}
+        feedback = Feedback(readings, position, velocity, filtered)
+        control = experiment.controller.step(control, feedback, target, drive, period)
+    return State(after, observers, filtered, identifier, controller=control), Signals(
+        sample.time, torque_in, twist, torque, sides.pop("motor"), sides.pop("load", None), sides, target
     )
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array
 from jaxbl.chain import Experiment, NamedArrays, Sample, Signals, TracedArrays, replay, scan, unit_noise
 from jaxbl.config import ConfigSource, read_config
 from jaxbl.config.study import suggest_path
+from jaxbl.control import AbstractReference, FunctionReference
 from jaxbl.drive.excitation import AbstractExcitation, FunctionInput
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.errors import InputError
@@ -39,8 +40,8 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
     """Make the experiment of a study, whose numbers are arrays.
 
     Args:
-        study: TOML file, mapping, config, or an :class:`Experiment` that is put together from classes; its `excitation` may
-            be a plain function of time (s) that returns the torque (N m).
+        study: TOML file, mapping, config, or an :class:`Experiment` that is put together from classes; its `excitation` and
+            `reference` may be plain functions of time (s) that return torque (N m) and position (rad).
         precision: of the numbers; left out, the study's `[run] precision`, which is float64 unless it says otherwise.
 
     Raises:
@@ -60,6 +61,8 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
         )
     if not isinstance(study.excitation, AbstractExcitation):
         study = dataclasses.replace(study, excitation=FunctionInput(study.excitation))
+    if study.reference is not None and not isinstance(study.reference, AbstractReference):
+        study = dataclasses.replace(study, reference=FunctionReference(study.reference))
     return as_arrays(study, dtype)
 
 

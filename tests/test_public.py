@@ -36,7 +36,7 @@ FLOORS = [
     {"result"},
     {"files", "validation", "workers"},
     {"cluster", "drive"},
-    {"observer", "records"},
+    {"control", "observer", "records"},
     {"chain"},
     {"config", "fused"},
     {"sweeps", "estimation"},

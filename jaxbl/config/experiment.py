@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import BeforeValidator, create_model, model_validator
 
 from jaxbl.chain import Run
+from jaxbl.control import CONTROLLERS, REFERENCES
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
@@ -64,6 +65,8 @@ ExcitationTable = tagged_union(
     [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
 )
 EffectTable = tagged_union([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
+ControllerTable = tagged_union([table_for(cls, kind=name) for name, cls in CONTROLLERS.items()], "kind")
+ReferenceTable = tagged_union([table_for(cls, kind=name) for name, cls in REFERENCES.items()], "kind")
 InitialTable = table_for(Initial)
 EncodersTable = table_for(Encoders)
 EquivalentControlTable = table_for(EquivalentControl)

@@ -228,7 +228,7 @@ def _validate(name: str, data: JsonObject, origins: Origins) -> Config:
         raise InputError(f"{name}: {text}" if name else text) from None
 
 
-_UNIONS = {(key,): 1 for key in ("drive", "transmission", "excitation", "observer")} | {
+_UNIONS = {(key,): 1 for key in ("drive", "transmission", "excitation", "observer", "controller", "reference")} | {
     ("effects",): 2,
     ("tune", "holdout"): 2,
 }

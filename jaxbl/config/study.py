@@ -27,6 +27,7 @@ from jaxbl.records.table import LogTable
 from jaxbl.validation import table_error
 
 from .experiment import (
+    ControllerTable,
     DriveTable,
     EffectTable,
     EncodersTable,
@@ -35,6 +36,7 @@ from .experiment import (
     IdentifierTable,
     InitialTable,
     ObserverTable,
+    ReferenceTable,
     RunTable,
     TransmissionTable,
 )
@@ -59,13 +61,17 @@ class Config(Table):
     transmission: TransmissionTable | None = declare_key("law of the gear; none on a rigid drive", None)
     effects: list[EffectTable] = declare_key("effects beyond the nominal drive", [], max_length=100)
     initial: InitialTable = declare_key("state at t = 0", default_factory=InitialTable)
-    excitation: ExcitationTable = declare_key("input torque")
+    excitation: ExcitationTable = declare_key(
+        "input torque; with a controller it is added to that one's, and may be left out"
+    )
     encoders: EncodersTable = declare_key("position sensors", default_factory=EncodersTable)
     observer: ObserverTable
     equivalent_control: EquivalentControlTable = declare_key(
         "low-pass on the equivalent control", default_factory=EquivalentControlTable
     )
     identifier: IdentifierTable = declare_key("recursive least squares", default_factory=IdentifierTable)
+    controller: ControllerTable | None = declare_key("what closes the loop", None)
+    reference: ReferenceTable | None = declare_key("position that the controlled side is to follow", None)
     run: RunTable = Field(default_factory=RunTable)
     sweep: SweepTable = Field(default_factory=SweepTable)
     uncertainty: UncertaintyTable = Field(default_factory=UncertaintyTable)
@@ -76,6 +82,14 @@ class Config(Table):
     axes: list[AxisTable] = Field([], max_length=50)
     figures: list[FigureTable] = Field([], max_length=200)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_input(cls, study: Any) -> Any:
+        """A controller needs no further input."""
+        if isinstance(study, Mapping) and "controller" in study and "excitation" not in study:
+            return dict(study) | {"excitation": {"kind": "sine", "amplitude": 0.0, "frequency": 0.0}}
+        return study
+
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
         if self.include:
@@ -83,6 +97,9 @@ class Config(Table):
         _check_sides(self)
         _check_effects(self)
         _check_input(self)
+        if (self.controller is None) != (self.reference is None):
+            missing = "[controller]" if self.controller is None else "[reference]"
+            raise table_error(f"{missing} is missing: a controller and the reference that it follows belong together")
         paths = numeric_paths(self)
         for path in self.uncertainty.exact:
             if path not in paths and path != "drive.gear_ratio" and path not in EFFECTS:
@@ -113,6 +130,8 @@ class Config(Table):
             transmission=None if self.transmission is None else self.transmission.build(),
             effects=tuple(effect.build() for effect in self.effects),
             identifier=None if self.drive.kind == "rigid" else self.identifier.build(),
+            controller=None if self.controller is None else self.controller.build(),
+            reference=None if self.reference is None else self.reference.build(),
         )
 
     def nominal_drive(self) -> NominalDrive:
@@ -158,6 +177,8 @@ def _check_sides(config: Config) -> None:
             raise table_error(f"{name}.load has no meaning on a rigid drive; remove it")
         if not rigid and table.load is None:
             raise table_error(f"{name}.load is missing: a two_inertia drive has a load observer; give its lambda and alpha")
+    if rigid and config.controller is not None and config.controller.side == "load":
+        raise table_error("controller.side: 'load' has no meaning on a rigid drive; it should be 'motor'")
     certificate = None if config.tune is None else config.tune.certificate
     if rigid and certificate is not None and certificate.load is not None:
         raise table_error("tune.certificate.load has no meaning on a rigid drive; remove it")
@@ -215,7 +236,7 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
     """Return all paths that an axis may vary in this config, with unit and description."""
     parameters_by_path: dict[str, Parameter] = {}
     for section in ("drive", "transmission", "initial", "excitation", "encoders", "observer", "equivalent_control",
-                    "identifier", "run"):  # fmt: skip
+                    "identifier", "run", "controller", "reference"):  # fmt: skip
         table = getattr(config, section)
         if table is not None:
             parameters_by_path |= dict(_paths(table, section))

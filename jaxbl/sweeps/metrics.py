@@ -36,6 +36,8 @@ class Metric(abc.ABC):
     doc: ClassVar[str]
     better: ClassVar[str] = ""
     """The better one of two values: `less` or `more`; empty if neither is."""
+    closed_loop: ClassVar[bool] = False
+    """True if only experiments with a controller have it."""
 
     @classmethod
     def of(cls, name: str, unit: str, label: str, doc: str, **options: Any) -> type[Self]:
@@ -46,7 +48,7 @@ class Metric(abc.ABC):
 
     def applies(self, experiment: Experiment) -> bool:
         """True if an experiment has this metric."""
-        return True
+        return experiment.controller is not None or not self.closed_loop
 
 
 def _check_metric(name: str, metric: Any) -> None:
@@ -86,6 +88,16 @@ class SideSample(NamedTuple):
     position_error: Number
     velocity_error: Number
     torque_error: Number
+    following_error: Number = 0.0
+    """Reference, in the side's units, minus true position, rad; 0 without a controller."""
+    driving_torque: Number = 0.0
+    """Torque that drives the side: the input on the motor, N_0 times the transmitted torque on the load, N m."""
+    before: Number = 0.0
+    """1 in the quarter before the last one, else 0."""
+    settled: Number = True
+    """True if the following error is within tolerance."""
+    period: Number = 0.0
+    """Sampling period, s."""
 
 
 class SideEnd(NamedTuple):
@@ -268,6 +280,113 @@ class Excitation(RunMetric):
         return end.experiment.identifier.excitation(end.state.identifier)
 
 
+class SettlingTime(ConvergenceTime):
+    """Time after which the following error stays within tolerance."""
+
+    name = "settling_time"
+    label = "settling time"
+    doc = "time from which the following error stays within the position tolerance; NaN where it does not"
+    carry = "last_unsettled"
+    closed_loop = True
+
+    def update(self, carry, sample):
+        return jnp.where(sample.settled, carry, sample.time)
+
+
+class TorqueReversals(RunMetric):
+    """Reversals of the driving torque; the state is their number and the last torque."""
+
+    name = "torque_reversals"
+    unit = "Hz"
+    label = "torque reversals"
+    doc = "sign changes of the driving torque (motor: the input; load: through the gear) a second, in the last quarter"
+    better = "less"
+    closed_loop = True
+
+    def init(self, zero):
+        return zero, zero
+
+    def update(self, carry, sample):
+        count, last = carry
+        torque = jnp.where(sample.driving_torque == 0.0, last, sample.driving_torque)
+        return count + sample.inside * (last * torque < 0.0), torque
+
+    def result(self, carry, end):
+        return carry[0] / (end.count * end.experiment.run.sample_period)
+
+
+class LimitCycle(NamedTuple):
+    """State of the limit cycle's metrics.
+
+    Attributes:
+        low, high: least and largest following error, rad, of the quarter before the last.
+        lowest, highest: the same of the last quarter.
+        armed: 1 if the error has been a quarter of the amplitude below the middle since it last crossed that upward.
+        last_error: of the sample before, rad.
+        first, last, count: first and last time of an upward crossing in the last quarter, s, and their number.
+    """
+
+    low: Number
+    high: Number
+    lowest: Number
+    highest: Number
+    armed: Number
+    last_error: Number
+    first: Number
+    last: Number
+    count: Number
+
+
+class LimitCycleAmplitude(RunMetric):
+    """Half of the peak-to-peak following error in the last quarter; the state is a :class:`LimitCycle`."""
+
+    name = "limit_cycle_amplitude"
+    unit = "rad"
+    label = "limit cycle, amplitude"
+    doc = "half of the following error's range in the last quarter"
+    better = "less"
+    carry = "limit_cycle"
+    closed_loop = True
+
+    def init(self, zero):
+        return LimitCycle(zero + jnp.inf, zero - jnp.inf, zero + jnp.inf, zero - jnp.inf, *[zero] * 5)
+
+    def update(self, carry, sample):
+        error, before, inside = sample.following_error, sample.before > 0.0, sample.inside > 0.0
+        middle, quarter = 0.5 * (carry.low + carry.high), 0.125 * (carry.high - carry.low)
+        crosses = inside & (carry.armed > 0.0) & (carry.last_error <= middle) & (error > middle)
+        rise = jnp.where(crosses, error - carry.last_error, 1.0)
+        time = sample.time - sample.period * jnp.where(crosses, (error - middle) / rise, 0.0)
+        return LimitCycle(
+            jnp.where(before, jnp.minimum(carry.low, error), carry.low),
+            jnp.where(before, jnp.maximum(carry.high, error), carry.high),
+            jnp.where(inside, jnp.minimum(carry.lowest, error), carry.lowest),
+            jnp.where(inside, jnp.maximum(carry.highest, error), carry.highest),
+            jnp.where(crosses, 0.0, jnp.where(inside & (error < middle - quarter), 1.0, carry.armed)),
+            error,
+            jnp.where(crosses & (carry.count == 0.0), time, carry.first),
+            jnp.where(crosses, time, carry.last),
+            carry.count + jnp.where(crosses, 1.0, 0.0),
+        )
+
+    def result(self, carry, end):
+        return 0.5 * (carry.highest - carry.lowest)
+
+
+class LimitCycleFrequency(LimitCycleAmplitude):
+    """Frequency at which the following error crosses its middle upward."""
+
+    name = "limit_cycle_frequency"
+    unit = "Hz"
+    label = "limit cycle, frequency"
+    doc = "frequency of the following error in the last quarter; 0 with less than two cycles there"
+    better = ""
+
+    def result(self, carry, end):
+        cycles = carry.count - 1.0
+        return jnp.where(cycles > 0.0, cycles / jnp.where(cycles > 0.0, carry.last - carry.first, 1.0), 0.0)
+
+
 def _convergence_time(formula: Callable[..., Array]) -> Callable[[GainMetric, ObserverGains, Array], Array]:
     """Make the method `judge` of a convergence time from its formula in gains, f_plus and initial errors."""
     return lambda _, gains, f_plus: formula(gains.lambda_, gains.alpha, f_plus, gains.position_error, gains.velocity_error)
@@ -334,6 +453,17 @@ for _metric in (
         "relative error of the identified dead zone (half gap of law dead_zone)",
     ),
     Excitation,
+    Rms.of("following_rmse", "rad", "following error, rms", "rms difference of reference and true position",
+           better="less", closed_loop=True, signal=lambda _, sample: sample.following_error),
+    Peak.of("following_peak", "rad", "following error, peak", "largest difference of reference and true position",
+            better="less", closed_loop=True, signal=lambda _, sample: sample.following_error),
+    SettlingTime,
+    LimitCycleAmplitude,
+    LimitCycleFrequency,
+    TorqueReversals,
+    Rms.of("torque_rms", "N m", "driving torque, rms",
+           "rms torque that drives the side (motor: the input; load: through the gear)",
+           better="less", closed_loop=True, signal=lambda _, sample: sample.driving_torque),
 ):  # fmt: skip
     SIDE_METRICS.add(_metric)
 
@@ -421,6 +551,8 @@ def _update_carries(
             jnp.abs(velocity) * ratio <= run.velocity_tolerance
         )
         sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
+        if signals.target is not None:
+            sample = _add_following(experiment, sample, side, index, signals)
         metrics = _carried_metrics(experiment, names).values()
         new_carry = tuple(metric.update(state, sample) for metric, state in zip(metrics, carry, strict=True))
         is_final = _are_metrics_final(names, experiment, carry)
@@ -429,6 +561,23 @@ def _update_carries(
             new_carry = jax.tree.map(functools.partial(jnp.where, is_final), carry, new_carry)
         new_carries[side] = new_carry
     return new_carries
+
+
+def _add_following(
+    experiment: Experiment, sample: SideSample, side: str, index: Int[Array, ""], signals: Signals
+) -> SideSample:
+    """Add to a side's sample what the metrics of a closed loop need."""
+    drive, run, controller = experiment.drive, experiment.run, experiment.controller
+    assert controller is not None and signals.target is not None and signals.torque is not None
+    start = window_start(run.steps)
+    error = signals.target.position * drive.ratio(controller.side) / drive.ratio(side) - sample.true.position
+    return sample._replace(
+        following_error=error,
+        driving_torque=signals.input if side == "motor" else drive.ratio(side) * signals.torque,
+        before=((index >= 2 * start - run.steps) & (index < start)).astype(signals.time.dtype),
+        settled=jnp.abs(error) * drive.ratio(side) <= run.position_tolerance,
+        period=run.sample_period,
+    )
 
 
 def _compute_results(

@@ -8,6 +8,7 @@ import pytest
 from paper_drive import paper_experiment
 
 from jaxbl.chain import scan
+from jaxbl.control import Cascade, Ramp
 from jaxbl.drive import DeadZone, LinearShaft, Rigid, SigmoidBacklash
 from jaxbl.errors import InputError
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers, conditions
@@ -152,8 +153,13 @@ def test_last_quarter(steps, first):
 
 
 def test_every_column_has_unit_and_meaning():
-    columns = metric_columns(paper_experiment())
+    controlled = paper_experiment(controller=Cascade(1.0, 1.0), reference=Ramp(0.0))
+    columns = metric_columns(controlled)
     assert len(columns) == 1 + 2 * len(SIDE_METRICS)
+    # in open loop nothing follows
+    assert set(columns) - set(metric_columns(paper_experiment())) == {
+        f"{side}.{name}" for side in ("motor", "load") for name, metric in SIDE_METRICS.items() if metric.closed_loop
+    }
     for column in columns:
         assert find_metric(column).doc
     assert find_metric("load.torque_rmse").unit == "N m"

@@ -1,0 +1,116 @@
+"""References: the position that a controlled side is to follow; velocity and acceleration are its derivatives.
+
+Installed packages add references by the entry-point group `jaxbl.references`; the entry point's name is the reference's.
+"""
+
+import abc
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxbl.drive.parameters import Scalar, ScalarArray, parameter
+from jaxbl.registry import Registry, check_module
+
+
+class Target(NamedTuple):
+    """What a side is to do at a sample: position (rad), velocity (rad/s), acceleration (rad/s^2)."""
+
+    position: Any
+    velocity: Any
+    acceleration: Any
+
+
+class AbstractReference(eqx.Module):
+    """A reference of the controlled side; `name` is the key `kind` of the config."""
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def position(self, time: ScalarArray) -> Any:
+        """Position (rad) at a time (s)."""
+
+    def target(self, time: ScalarArray) -> Target:
+        """Position and its derivatives at a time (s); at a jump the derivatives are those beside it."""
+        one = jnp.ones_like(time)
+
+        def move(at: ScalarArray) -> Any:
+            return jax.jvp(self.position, (at,), (one,))
+
+        (position, velocity), (_, acceleration) = jax.jvp(move, (time,), (one,))
+        return Target(position, velocity, acceleration)
+
+
+class FunctionReference(AbstractReference):
+    """A plain function of time (s) that returns the position (rad); JAX traces it, and differentiates it."""
+
+    name = "function"
+    function: Callable[[ScalarArray], Any] = eqx.field(static=True)
+
+    def position(self, time):
+        return self.function(time)
+
+
+REFERENCES = Registry("jaxbl.references", partial(check_module, base=AbstractReference))
+"""References by name, those of installed packages included."""
+
+
+@REFERENCES.add
+class SineReference(AbstractReference):
+    """Sine: offset + amplitude sin(2 pi frequency t)."""
+
+    name = "sine"
+    amplitude: Scalar = parameter("rad", "amplitude")
+    frequency: Scalar = parameter("Hz", "frequency", minimum=0.0)
+    offset: Scalar = parameter("rad", "constant part", default=0.0)
+
+    def position(self, time):
+        return self.offset + self.amplitude * jnp.sin(2.0 * jnp.pi * self.frequency * time)
+
+
+@REFERENCES.add
+class Ramp(AbstractReference):
+    """Ramp: a constant speed from `start` on."""
+
+    name = "ramp"
+    speed: Scalar = parameter("rad/s", "speed")
+    start: Scalar = parameter("s", "time at which the ramp begins", default=0.0, minimum=0.0)
+
+    def position(self, time):
+        return self.speed * jnp.maximum(time - self.start, 0.0)
+
+
+@REFERENCES.add
+class StepsReference(AbstractReference):
+    """Steps between 0 and `size`, each level held for `hold` seconds; the first is 0. A size of 0 holds the axis still."""
+
+    name = "steps"
+    size: Scalar = parameter("rad", "size of the steps")
+    hold: Scalar = parameter("s", "time that each level is held", above=0.0)
+
+    def position(self, time):
+        # times are rounded: a step must not come a sample late
+        return self.size * jnp.mod(jnp.floor(time / self.hold + 1e-4), 2.0)
+
+
+@REFERENCES.add
+class Moves(AbstractReference):
+    """Moves from 0 to `distance` and back by S-curves of least jerk, x = 10 s^3 - 15 s^4 + 6 s^5, with a rest after each.
+
+    Reference: T. Flash, N. Hogan, J. Neuroscience 5 (1985).
+    """
+
+    name = "moves"
+    distance: Scalar = parameter("rad", "distance of a move")
+    duration: Scalar = parameter("s", "duration of a move", above=0.0)
+    rest: Scalar = parameter("s", "rest after each move", default=0.5, minimum=0.0)
+
+    def position(self, time):
+        cycles = time / (self.duration + self.rest)
+        move = jnp.floor(cycles)
+        s = jnp.minimum((cycles - move) * (self.duration + self.rest) / self.duration, 1.0)
+        rise = s * s * s * (10.0 + s * (6.0 * s - 15.0))
+        return self.distance * jnp.where(jnp.mod(move, 2.0) == 0.0, rise, 1.0 - rise)
