@@ -94,7 +94,7 @@ class State(eqx.Module):
         observer: by side.
         equivalent_control: filtered equivalent control of each side, rad/s^2.
         identifier: None if the experiment has no identifier, or no transmission.
-        controller: None if the experiment has none.
+        controller: None in a replay of a record, or if the experiment has none.
     """
 
     plant: PlantState | None
@@ -113,6 +113,7 @@ class Sample(NamedTuple):
         input: torque, N m; in a simulation it replaces excitation and controller.
         measured: position of each side, rad.
         added_accelerations: by side, rad/s^2; the observers add them to the nominal ones, held until the next sample.
+        target: of the controlled side; it replaces the reference.
     """
 
     time: Number
@@ -120,6 +121,7 @@ class Sample(NamedTuple):
     input: Number | None = None
     measured: dict[str, Number] | None = None
     added_accelerations: dict[str, Number] | None = None
+    target: Target | None = None
 
 
 class TrueSide(NamedTuple):
@@ -203,7 +205,7 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     if experiment.identifier is not None and experiment.transmission is not None:
         identifier = experiment.identifier.init(experiment.transmission, experiment.sides, zero)
     controller = None
-    if experiment.controller is not None:
+    if experiment.controller is not None and measured is None:
         controller = experiment.controller.start({side: zero + position[side] for side in experiment.sides})
     return State(plant, observer_states, zeros, identifier, controller=controller)
 
@@ -290,8 +292,12 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
         missing = drive.acceleration("motor", before.velocity["motor"], torque_in) - sides["motor"].true.acceleration
         torque = drive.inertia("motor") * missing
     control, target = state.controller, None
-    if experiment.controller is not None and experiment.reference is not None and control is not None:
-        target = experiment.reference.target(sample.time)
+    if control is not None:
+        assert experiment.controller is not None
+        target = sample.target
+        if target is None:
+            assert experiment.reference is not None
+            target = experiment.reference.target(sample.time)
         position = {side: sides[side].position_estimate for side in drive.sides}
         velocity = {side: sides[side].velocity_estimate for side in drive.sides}
         feedback = Feedback(readings, position, velocity, filtered)

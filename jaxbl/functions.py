@@ -45,7 +45,7 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
         precision: of the numbers; left out, the study's `[run] precision`, which is float64 unless it says otherwise.
 
     Raises:
-        InputError: wrong study, or float64 while JAX computes in float32.
+        InputError: wrong study, a controller without a reference, or float64 while JAX computes in float32.
 
     Example:
         >>> axis = jaxbl.experiment("axis.toml")
@@ -61,6 +61,8 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
         )
     if not isinstance(study.excitation, AbstractExcitation):
         study = dataclasses.replace(study, excitation=FunctionInput(study.excitation))
+    if (study.controller is None) != (study.reference is None):
+        raise InputError("experiment: a controller and the reference that it follows belong together; give both, or none")
     if study.reference is not None and not isinstance(study.reference, AbstractReference):
         study = dataclasses.replace(study, reference=FunctionReference(study.reference))
     return as_arrays(study, dtype)

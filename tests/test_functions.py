@@ -170,6 +170,20 @@ def test_metrics_are_those_of_a_run():
             np.testing.assert_allclose(found[name], value, rtol=1e-9, err_msg=name)
 
 
+def test_a_record_needs_no_controller(page):
+    """What observers see of a closed loop's record is what they saw in the loop; targets may be given sample by sample."""
+    servo = jaxbl.with_values(page["servo"], {"run.steps": 300})
+    signals = jaxbl.simulate(servo)
+    seen = jaxbl.observe(servo, signals.input, {side: signals.side(side).measured for side in ("motor", "load")})
+    assert seen.target is None
+    np.testing.assert_allclose(seen.load.velocity_estimate, signals.load.velocity_estimate, rtol=1e-9, atol=1e-12)
+
+    state, samples = jaxbl.initial_state(servo), jaxbl.samples(servo)._replace(target=signals.target)
+    no_reference = dataclasses.replace(servo, reference=None)
+    _, again = jax.lax.scan(lambda state, sample: jaxbl.step(no_reference, state, sample), state, samples)
+    np.testing.assert_allclose(again.input, signals.input, rtol=1e-9, atol=1e-12)
+
+
 def test_sharding_over_devices_changes_nothing(page):
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
     count = 4 * len(jax.devices())
@@ -202,6 +216,10 @@ def test_never_float32_unasked():
             "'run.sample_period' is no number that may differ between lanes",
         ),
         (lambda axis: jaxbl.metrics(axis, names=("speed",)), "'speed' is no metric"),
+        (
+            lambda axis: jaxbl.experiment(dataclasses.replace(axis, controller=jaxbl.Cascade(1.0, 1.0))),
+            "a controller and the reference that it follows belong together",
+        ),
     ],
 )
 def test_wrong_calls_are_told_in_one_line(call, message):

@@ -56,6 +56,11 @@ class AbstractController(eqx.Module):
         "N m/s", "fastest change of the torque; left out: none", default=None, above=0.0, kw_only=True
     )
 
+    @property
+    def reads_observers(self) -> bool:
+        """True if the torque depends on estimates, so that the motion changes with the observers' gains."""
+        return True
+
     @abc.abstractmethod
     def start(self, measured: dict[str, Any]) -> ControllerState:
         """Return the state before the first sample, at the sides' readings (rad)."""

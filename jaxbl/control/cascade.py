@@ -41,6 +41,10 @@ class Cascade(AbstractController):
     gap_compensation: Scalar = parameter("rad", "half gap to compensate, on the motor side", default=0.0, minimum=0.0)
     gap_speed: Scalar = parameter("rad/s", "motor speed at which the gap is crossed", default=10.0, above=0.0)
 
+    @property
+    def reads_observers(self):
+        return self.speed_from == "observer"
+
     def start(self, measured):
         zero = jnp.zeros_like(measured["motor"])
         # integral, speed, last reading, lead over the gap

@@ -1,4 +1,4 @@
-"""The chain that runs in real time beside a drive: observers, equivalent control, identifier, as one block."""
+"""The chain that runs in real time beside a drive: observers, equivalent control, identifier, controller, as one block."""
 
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxbl.chain import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block, find_missed, initial_state, step
 from jaxbl.config import Config
+from jaxbl.control import Target
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
 
 from .block import Block, Outputs, Port, StudyNumber, Values, trace_block
@@ -31,7 +32,7 @@ class _ChainState(State):
 
 
 def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
-    """Trace what `jaxbl.chain.step` does with a recorded input and measured positions.
+    """Trace what `jaxbl.chain.step` does with a recorded input and measured positions; a controller is given its target.
 
     The identifier counts samples from `identifier.start` on; its sums are compensated every `LONGEST_BLOCK` samples, as in
     :func:`jaxbl.chain.replay`.
@@ -47,20 +48,30 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
     sides = experiment.sides
     positions = [Port(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]
     torque = Port("input", "N m", "input torque, held from this sample to the next", dtype)
+    targets = []
+    if experiment.controller is not None:
+        units = zip(Target._fields, ("rad", "rad/s", "rad/s^2"), strict=True)
+        owner = f"that the {experiment.controller.side} is to have"
+        targets = [Port(f"target_{name}", unit, f"{name} {owner}", dtype) for name, unit in units]
 
     def start(numbers: Values, inputs: Values) -> _ChainState:
         readings = {side: inputs[f"{side}_position"] for side in sides}
         measured = {side: jnp.where(jnp.isfinite(reading), reading, 0.0) for side, reading in readings.items()}
-        zero = jnp.zeros((), jnp.int32)
-        state = initial_state(set_leaves(experiment, numbers), measured)
-        return _ChainState(**vars(state), samples=zero, missed=dict.fromkeys(sides, zero))
+        zero, lane = jnp.zeros((), jnp.int32), set_leaves(experiment, numbers)
+        state = vars(initial_state(lane, measured))
+        if lane.controller is not None:
+            state |= {"controller": lane.controller.start(measured)}
+        return _ChainState(**state, samples=zero, missed=dict.fromkeys(sides, zero))
 
     def sample(numbers: Values, state: _ChainState, inputs: Values) -> tuple[_ChainState, Outputs]:
         lane = set_leaves(experiment, numbers)
         measured = {side: inputs[f"{side}_position"] for side in sides}
         time = state.samples.astype(dtype) * lane.run.sample_period
-        new, signals = step(lane, state, Sample(time, input=inputs["input"], measured=measured))
+        target = Target(*(inputs[port.name] for port in targets)) if targets else None
+        new, signals = step(lane, state, Sample(time, input=inputs["input"], measured=measured, target=target))
         out: Outputs = {}
+        if new.controller is not None:
+            out["controller_torque"] = new.controller.torque, "N m", "input torque from the next sample on"
         missed = find_missed(measured, inputs["input"])
         counts = jax.tree.map(lambda count, more: jnp.minimum(count, LAST_SAMPLE - 1) + more, state.missed, missed)
         for side in sides:
@@ -88,7 +99,7 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         samples = jnp.where(state.samples == LAST_SAMPLE, LAST_SAMPLE - LONGEST_BLOCK, state.samples) + 1
         return _ChainState(**vars(compensated), samples=samples, missed=counts), out
 
-    return trace_block(name, dtype, study_numbers, positions, [torque, *positions], start, sample)
+    return trace_block(name, dtype, study_numbers, positions, [torque, *positions, *targets], start, sample)
 
 
 def read_study_numbers(experiment: Experiment) -> dict[str, StudyNumber]:

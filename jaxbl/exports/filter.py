@@ -9,12 +9,13 @@ from .writer import write_comment
 
 def input_columns(program: Program) -> list[str]:
     """Return the columns that the program reads."""
-    positions = program.block.start_inputs
-    return ["t", "u", *(POSITION_CHANNELS[position.name.removesuffix("_position")] for position in positions)]
+    channels = {"input": "u"} | {f"{side}_position": channel for side, channel in POSITION_CHANNELS.items()}
+    return ["t", *(channels.get(port.name, port.name) for port in program.block.inputs)]
 
 
 def write_filter_code(program: Program) -> str:
-    """Write the program, which reads columns `t,u,theta_e,theta_s` (`t,u,theta_e` of a rigid drive)."""
+    """Write the program, which reads columns `t,u,theta_e,theta_s` (`t,u,theta_e` of a rigid drive), and with a controller
+    those of its target."""
     block, name = program.block, program.block.name
     real, single = c_type(block.dtype), c_type(block.dtype) == "float"
     csv_columns = input_columns(program)
@@ -35,7 +36,7 @@ def write_filter_code(program: Program) -> str:
         names.append(output.name)
         formats.append("%d" if is_whole else real_format)
         printed.append(f"{'(int)' if is_whole else cast}outputs.{output.name}")
-    places = {"input": "row[1]"} | {quantity.name: f"row[{2 + i}]" for i, quantity in enumerate(block.start_inputs)}
+    places = {port.name: f"row[{1 + i}]" for i, port in enumerate(block.inputs)}
     return f'''{write_comment(C_MARKS, *remarks)}
 
 #include <stdio.h>

@@ -157,7 +157,9 @@ def _export_fmu(request: Request) -> Files:
 
 _OF_CODE = "precision", "name"
 TARGETS: dict[str, Target] = {
-    "c": Target("C99: observers, equivalent control and identifier, one source file and one header", _export_c, _OF_CODE),
+    "c": Target(
+        "C99: observers, equivalent control, identifier, controller; one source file, one header", _export_c, _OF_CODE
+    ),
     "st": Target("structured text (IEC 61131-3): the same as a function block", _export_st, _OF_CODE),
     "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _export_mjcf, ("linear",)),
     "fmu": Target("the drive as a Functional Mock-up Unit for co-simulation", _export_fmu, (*_OF_CODE, "fmi"), "drive"),
@@ -272,7 +274,8 @@ def _write_head_of_code(request: Request, program: Program, call: list[str]) -> 
     sides = [quantity.name.removesuffix("_position") for quantity in program.block.start_inputs]
     parts = f"{'observers' if len(sides) > 1 else 'observer'} of {' and '.join(sides)}, equivalent control"
     identifier = ", identifier" if any(quantity.name.endswith("_identified") for quantity in program.block.outputs) else ""
-    return _write_head(request, f"{request.name}: {parts}{identifier}, from sample to sample.", call)
+    controller = "" if request.config.controller is None else ", controller"
+    return _write_head(request, f"{request.name}: {parts}{identifier}{controller}, from sample to sample.", call)
 
 
 def _write_head(request: Request, first_line: str, call: list[str]) -> list[str]:

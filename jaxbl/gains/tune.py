@@ -72,7 +72,8 @@ def tune(
         study: TOML file, mapping or config. Its `[tune]` table holds the objective and the constraints; its axes are unused.
 
     Raises:
-        InputError: the config is wrong, the folder holds something else, or the backend cannot run the study.
+        InputError: the config is wrong, or its controller reads the observers; the folder holds something else, or the
+            backend cannot run the study.
         NoResult: no gains in the range meet the constraints, or the drive diverges.
 
     Example:
@@ -85,6 +86,11 @@ def tune(
         raise InputError(
             f"observer.kind: tune chooses lambda and alpha of kind '{AbstractSuperTwisting.name}'; for the gains of "
             f"'{config.observer.kind}', put observers = [\"{config.observer.kind}\"] into [tune]"
+        )
+    if config.controller is not None and config.controller.build().reads_observers:
+        raise InputError(
+            "controller: it reads the observers whose gains tune searches, so that each gain makes another motion; "
+            "let a cascade have speed_from = 'differences', or sweep over observer and controller gains"
         )
     config = config.model_copy(update={"tune": table})
     scenarios = None if table.observers else list_scenarios(config, table)

@@ -60,6 +60,9 @@ def describe_trial(trial: Trial) -> Result:
     units = {"velocity": "rad/s", "torque": "N m"}
     errors = {(side, quantity): metrics[f"{side}.{quantity}_rmse"] for side in sides for quantity in units}
     bounds = {(side, "velocity"): f"; the largest may be {limits.velocity_tolerance / ratios[side]:.3g}" for side in sides}
+    if trial.config.controller is not None:
+        side, units["following"] = trial.config.controller.side, "rad"
+        errors[side, "following"] = metrics[f"{side}.following_rmse"]
     figures = [
         KeyFigure(
             "diverges" if error is None else f"{error:.3g} {units[key[1]]}",
@@ -94,6 +97,8 @@ def draw_trial(trial: Trial) -> list[Figure]:
     figures += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
     panel = Panel(_TIME, Axis("input torque u (N m)"), [Line(trace["t"], trace["u"])])
     figures.append(Figure("input", [panel], "Input torque (analogue of Fig. 7).", height=2.4))
+    if trial.config.controller is not None:
+        figures.append(_draw_following(trace, trial.config.controller.side))
     judged = trial.summary["conditions"]
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     figures += [error_plane(trace, side, gains) for side, gains in judged.items()]
@@ -117,6 +122,16 @@ def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Figure:
     ]
     caption = f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of Figs. {_FIGURES[name]})."
     return stack(f"{side}_{quantity}", panels, caption)
+
+
+def _draw_following(trace: DataFrame, side: str) -> Figure:
+    time, target, true = trace["t"], trace["reference"], trace[f"{side}.position"]
+    lines = [Line(time, target, "reference", VERMILION, 2.4, opacity=0.8), Line(time, true, "true", width=1.0)]
+    panels = [
+        Panel(_TIME, Axis(f"{side} position (rad)"), lines),
+        Panel(_TIME, Axis("following error (rad)"), [ZERO, Line(time, target - true, colour=BLUE)]),
+    ]
+    return stack("following", panels, f"{side.capitalize()} position, the reference that it is to follow, and the error.")
 
 
 def _torque(trace: DataFrame, sides: list[str]) -> Figure:

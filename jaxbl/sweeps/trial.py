@@ -140,6 +140,8 @@ def _trace_row(experiment: Experiment, state: State, signals: Signals) -> Traced
     if signals.twist is not None:
         row["z"] = signals.twist
     row["torque"] = signals.torque
+    if signals.target is not None:
+        row["reference"] = signals.target.position
     for side in experiment.sides:
         s = signals.side(side)
         true = {f"{side}.{name}": getattr(s.true, name) for name in ("position", "velocity", "acceleration")}

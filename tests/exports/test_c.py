@@ -9,6 +9,7 @@ import pytest
 from native import COMPILERS, STRICT, UNCONTRACTED, Native, draw_samples, run_program, to_integers
 from small_study import small_study
 from strict import Strict
+from structured_text import FunctionBlock
 
 import jaxbl
 from jaxbl.chain import replay
@@ -91,7 +92,53 @@ def test_many_steps_are_the_traced_step_bit_for_bit(exported_code, repeats):
     assert (to_integers(run_native(native, inputs)) == to_integers(run_strict(study(), "double", inputs))).all()
 
 
+CONTROLLERS = {
+    "cascade": {"side": "load", "position_gain": 8.0, "speed_gain": 0.5, "integral_time": 0.1, "torque_limit": 0.3,
+                "torque_rate": 50.0, "speed_limit": 3.0, "gap_compensation": 0.01, "friction_feedforward": 0.02},
+    "state_feedback": {"motor_position": 3.0, "motor_velocity": 0.5, "load_velocity": 0.2},
+}  # fmt: skip
+
+
 @pytest.mark.program("gcc")
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_observer_and_controller_are_one_function(tmp_path, kind):
+    """Given the readings and targets of a simulated loop, the code asks for the torques of that loop."""
+    loop = {"controller": {"kind": kind} | CONTROLLERS[kind],
+            "reference": {"kind": "moves", "distance": 0.3, "duration": 0.2},
+            "excitation": {"kind": "sine", "amplitude": 0.0, "frequency": 1.0}}  # fmt: skip
+    data = study("extended_state", **loop)
+    signals = jaxbl.simulate(jaxbl.experiment(data))
+    inputs = np.stack([signals.input, signals.motor.measured, signals.load.measured, *signals.target], axis=1)
+    native = export_native(tmp_path, data)
+    # where the simulated observers start
+    native.start([signals.motor.true.position[0], signals.load.true.position[0]])
+    outputs = native.run(inputs)
+    names = [output["name"] for output in native.summary["outputs"]]
+    assert [port["name"] for port in native.summary["inputs"]][3:] == [
+        "target_position", "target_velocity", "target_acceleration"
+    ]  # fmt: skip
+    torque = outputs[:, names.index("controller_torque")]
+    assert np.ptp(torque) > 0.2
+    np.testing.assert_allclose(torque[:-1], signals.input[1:], rtol=1e-9, atol=1e-9)
+    # in structured text as well
+    jaxbl.export(data, tmp_path / "st", "st", name="drive")
+    block, ports = FunctionBlock((tmp_path / "st" / "drive.st").read_text()), native.summary["inputs"]
+    native.start(inputs[0, 1:3])
+    torque = native.run(inputs)[:, names.index("controller_torque")]
+    found = [block(**{port["name"]: x for port, x in zip(ports, row, strict=True)}) for row in inputs[:100]]
+    np.testing.assert_array_equal([row["controller_torque"] for row in found], torque[:100])
+
+    folder = tmp_path / "again"
+    jaxbl.export(data, folder, name="drive")
+    run_program("gcc", *STRICT, *UNCONTRACTED, "-O2", "drive.c", "drive_filter.c", "-lm", "-o", "filter", cwd=folder)
+    columns = "t,u,theta_e,theta_s,target_position,target_velocity,target_acceleration"
+    rows = np.column_stack([signals.time, inputs])
+    np.savetxt(folder / "log.csv", rows, fmt="%.17g", delimiter=",", header=columns, comments="")
+    run_program(folder / "filter", "log.csv", "found.csv", cwd=folder)
+    found = np.genfromtxt(folder / "found.csv", delimiter=",", names=True)
+    assert (found["controller_torque"] == torque).all()
+
+
 @pytest.mark.program("gcc")
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_nothing_is_identified_after_a_standstill(tmp_path, precision):

@@ -45,6 +45,18 @@ def test_the_bound_is_the_largest_of_the_run_and_of_the_start(tuned_study):
     assert not pilot["starting_error_assumed"]
 
 
+CASCADE = {"kind": "cascade", "position_gain": 10.0, "speed_gain": 1.0, "speed_from": "differences", "speed_filter": 0.01}
+LOOP = {"controller": CASCADE, "reference": {"kind": "sine", "amplitude": 0.1, "frequency": 1.0}}
+
+
+def test_a_loop_that_reads_no_observer_changes_no_gains(tuned_study):
+    """The disturbance is the same constant torque along another motion."""
+    closed = tune(rigid_tune_study(**LOOP))
+    assert closed.summary["f_plus"]["motor"] == pytest.approx(tuned_study.summary["f_plus"]["motor"], rel=1e-3)
+    gains, usual = (result.summary["gains"]["motor"] for result in (closed, tuned_study))
+    assert gains["alpha"] == pytest.approx(usual["alpha"], rel=1e-2)
+
+
 def test_optimum_agrees_with_brute_force_over_a_fine_grid(tuned_study):
     """A sweep of its own over 11 x 11 gains finds none that is feasible and much better."""
     bound = tuned_study.summary["f_plus"]["motor"]
@@ -364,6 +376,10 @@ BAD = {
         "tune.holdout.kind: unknown kind 'sinus'; did",
     ),
     "key of the holdout": (rigid_tune_study(tune={"holdout": {"kind": "sine", "a": 1}}), "tune.holdout: unknown key 'a'"),
+    "loop that reads the observer": (
+        rigid_tune_study(**LOOP | {"controller": CASCADE | {"speed_from": "observer"}}),
+        "controller: it reads the observers whose gains tune searches",
+    ),
     "no inertia left": (
         rigid_tune_study({"uncertainty.relative": 1.5}, tune={"worst_over_uncertainty": True}),
         "uncertainty.relative: 1.5 leaves no inertia on the motor",

@@ -15,6 +15,11 @@ CASES = {
     "dead zone": (small_study(transmission={"law": "dead_zone", "stiffness": 1.0, "half_gap": 0.01}), BOTH_SIDES),
     "shaft": (small_study(transmission={"law": "linear_shaft", "stiffness": 1.0}), BOTH_SIDES),
     "rigid": (rigid_study(), [*BOTH_SIDES[:3], "input", "gain_conditions_motor", "error_plane_motor"]),
+    "closed loop": (
+        small_study(controller={"kind": "cascade", "position_gain": 5.0, "speed_gain": 1.0},
+                    reference={"kind": "sine", "amplitude": 0.1, "frequency": 2.0}),
+        [*BOTH_SIDES[:6], "following", *BOTH_SIDES[6:]],
+    ),
     # nothing moves, nothing is identified
     "at rest": (
         small_study({"excitation.amplitude": 0.0, "encoders.noise": 0.0, "observer.motor.velocity_error": 0.0}), AT_REST
