@@ -158,7 +158,7 @@ def _export_fmu(request: Request) -> Files:
 _OF_CODE = "precision", "name"
 TARGETS: dict[str, Target] = {
     "c": Target(
-        "C99: observers, equivalent control, identifier, controller; one source file, one header", _export_c, _OF_CODE
+        "C99: observers, equivalent control, identifier and controller, a source file and a header", _export_c, _OF_CODE
     ),
     "st": Target("structured text (IEC 61131-3): the same as a function block", _export_st, _OF_CODE),
     "mjcf": Target("a MuJoCo model of the drive, its gap and its effects", _export_mjcf, ("linear",)),
