@@ -17,8 +17,6 @@ from .reference_log import Errors
 
 LEAST_CHANCE = 0.01
 """Alternatives of a lower probability are not listed."""
-_SURELY = 50.0
-"""Nats beyond which odds are no other."""
 
 
 class Finding(NamedTuple):
@@ -48,8 +46,8 @@ def _weigh(explanation: Explanation, name: str) -> Finding:
     if (plain := special_case(fitted, name)) is not None:
         # as likely by the fit
         odds[plain] = 1.0
-    # what is still unknown may stand in its place: it gains as much
-    unknown = float(np.exp(min(explanation.largest_gain - gain.nats, _SURELY)))
+    # what is still unknown may stand in its place: odds by the squares of gains part right from wrong on generated logs
+    unknown = (max(explanation.largest_gain, 0.0) / max(gain.nats, 1.0)) ** 2
     total = 1.0 + sum(odds.values()) + unknown
     # no surer than that its torque is not zero, nor than that it makes the model better by blocks
     least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
