@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, Union
 
 from .errors import InputError, NoResult, shorten
+from .lines import format_duration
 from .workers import announce, check_cost, count_cores, start_jax
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ _LOCAL_A_CORE, _FEWEST_LOCAL = 2, 8
 """Most local workers a core, and most on a machine with few: a job takes all cores of its worker."""
 _WORKER_BYTES = 6e8
 """Bytes of a local worker that has imported JAX and compiled a study."""
+_WORKERS_SECONDS = 3600.0
+"""Longest time without any worker: a queue of a cluster may start the first ones late."""
 _POLL_SECONDS = 0.05
 """Time between two looks at which jobs have ended."""
 _AHEAD, _FEWEST_AHEAD = 4, 16
@@ -91,14 +94,18 @@ class Cluster:
 
         waiting, begun = iter(jobs), {}
         finished = as_completed(loop=self._client.loop)
-        most, counted = 0, -_COUNT_SECONDS
+        most, counted, seen = 0, -_COUNT_SECONDS, time.monotonic()
         try:
             while True:
                 if self._client.status != "running":
                     raise NoResult(_LOST)
                 if time.monotonic() - counted > _COUNT_SECONDS:
                     most, counted = max(_AHEAD * self.workers, _FEWEST_AHEAD), time.monotonic()
-                if not self._client.nthreads():
+                if self._client.nthreads():
+                    seen = time.monotonic()
+                elif time.monotonic() - seen > _WORKERS_SECONDS:
+                    raise NoResult(f"no worker has come for {format_duration(_WORKERS_SECONDS)}; {_KEPT}")
+                else:
                     announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
@@ -152,7 +159,8 @@ class Cluster:
             ) from None
 
 
-_LOST = "the connection to the scheduler is lost; what is finished is kept, and the same command goes on from there"
+_KEPT = "what is finished is kept, and the same command goes on from there"
+_LOST = f"the connection to the scheduler is lost; {_KEPT}"
 
 
 def _call(function: Callable[[Job], Result], asking: str, job: Job) -> Result:

@@ -200,7 +200,7 @@ LOGS = {
     "drifting": lambda folder: write_table_and_model(folder, "[log]\ntheta_s = { drift = -1e9 }\n"),
     "unpacks": lambda folder: write_hdf5(folder, compressed_dataset("junk", 2_000_000_000)),
     "unpacks twice": lambda folder: write_hdf5(folder, compressed_dataset("junk", 2, 2_000_000_000)),
-    "unpacks in use": lambda folder: write_hdf5(folder, compressed_dataset("u", 2_000_000_000)),
+    "unpacks in use": lambda folder: write_hdf5(folder, compressed_dataset("u", 2_000_000_000_000)),
     "unpacks less": lambda folder: write_hdf5(folder, compressed_dataset("u", 90_000_000)),
     "unpacks cells": lambda folder: write_hdf5(folder, compressed_dataset("cells", 2_000_000_000, dtype=h5py.ref_dtype)),
     "external": lambda folder: write_hdf5(folder, store_elsewhere),

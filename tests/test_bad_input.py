@@ -61,7 +61,7 @@ EXPECTED_LINES = {
     "log drifting": "log.theta_s.drift: should be greater than or equal to -0.1, not -1000000000.0",
     "log unpacks": "",
     "log unpacks twice": "",
-    "log unpacks in use": "column 'u' has 2000000000 values; at most 100000000 can be read",
+    "log unpacks in use": "column 'u' of 2000000000000 values takes 8e+04 GB of memory",
     "log unpacks less": "column 'u' has 90000000 values and the time 400; they should be equally many",
     "log unpacks cells": "",
     "log external": "Not read: theta_s: links are not followed",

@@ -213,11 +213,11 @@ def _(effect, parts, side):
 
 @_add.register(Tabulated)
 def _(effect, parts, side):
-    if effect.speeds:
+    if len(effect.speeds):
         return unsaid("the damping of a joint is a cubic in the velocity, no table")
-    if effect.positions and effect.turn:
+    if len(effect.positions) and effect.turn:
         return unsaid("springs know no turns: a table within a turn does not repeat")
-    if effect.positions:
+    if len(effect.positions):
         parts.add_piecewise_torque(side, effect.positions, effect.position_torques)
     return exactly("springs of the joint, slack up to the points of a table over position; one over speed is not said")
 

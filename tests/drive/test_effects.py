@@ -7,6 +7,7 @@ import re
 import types
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from effect_values import ENCODERS, VALUES
 from scipy.integrate import solve_ivp
 
 from jaxbl.drive import EFFECTS, LinearShaft, Plant, TwoInertia, as_arrays, make_effect, parameters
-from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction, angle, base, size
+from jaxbl.drive.effects import CoulombFriction, Motion, SideEffect, StribeckFriction, angle, base, size, tables
 from jaxbl.drive.parameters import parameter
 
 DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -423,3 +424,45 @@ def test_memory_moves_with_the_positions_to_second_order():
         errors.append(np.abs(end - expected).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
     assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("turn", [False, True])
+@pytest.mark.parametrize("table", ["position", "speed", "both"])
+def test_a_long_table_is_looked_up_and_not_traced_point_by_point(turn, table):
+    """The program has one size for all tables; the torque is that of linear interpolation, constant beyond the ends."""
+    rng = np.random.default_rng(3)
+    points = np.cumsum(rng.uniform(1e-4, 2e-3, 10_000))
+    torques = rng.normal(size=len(points))
+    numbers = {}
+    if table != "speed":
+        numbers |= {"positions": tuple(points), "position_torques": tuple(torques)}
+    if table != "position":
+        numbers |= {"speeds": tuple(-points[::-1]), "speed_torques": tuple(torques)}
+    with jax.enable_x64(True):
+        effect = as_arrays(make_effect("load.tabulated", turn=turn, **numbers), float)
+        position, velocity = (np.append(np.linspace(low, 11.0, 301), points[:5]) for low in (-2.0, -11.0))
+
+        def resist(position, velocity):
+            return effect.resist((), Motion(0.0, position, velocity))
+
+        assert len(jax.make_jaxpr(resist)(1.0, 1.0).eqns) < 100
+        torque = jax.jit(resist)(position, velocity)
+    inside = position % (2.0 * np.pi) if turn else position
+    expected = np.interp(inside, points, torques) if table != "speed" else 0.0
+    expected = expected + (np.interp(velocity, -points[::-1], torques) if table != "position" else 0.0)
+    np.testing.assert_allclose(torque, expected, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("count", [2, 3, 64, 65, 300])
+def test_short_and_long_tables_agree(count, monkeypatch):
+    """One beyond the limit has the torque that a chain of all its points gives."""
+    points, torques = np.linspace(-1.0, 1.0, count).tolist(), np.sin(np.arange(count)).tolist()
+    numbers = {"positions": tuple(points), "position_torques": tuple(torques)}
+    x = np.linspace(-1.5, 1.5, 1001)
+    found = []
+    with jax.enable_x64(True):
+        for limit in (10_000, 0):
+            monkeypatch.setattr(tables, "_CHAINED_POINTS", limit)
+            effect = as_arrays(make_effect("motor.tabulated", **numbers), float)
+            found.append(np.broadcast_to(effect.resist((), Motion(0.0, x, 0.0)), x.shape))
+    np.testing.assert_allclose(*found, rtol=0.0, atol=1e-13)

@@ -1,13 +1,17 @@
 """A torque that is interpolated in tables, as it was measured."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..parameters import Scalar, option
 from .base import EFFECTS, Number, SideEffect, table
+
+_CHAINED_POINTS = 64
+"""Most points of a table that every compiled loop takes; each of them makes a program longer, and 10 000 take minutes."""
 
 
 @EFFECTS.add
@@ -22,6 +26,11 @@ class Tabulated(SideEffect):
     turn: bool = option("the position within a turn counts, from 0 to 2 pi rad", default=False)
     speeds: tuple[Scalar, ...] = table("rad/s", "points of the table over speed, increasing")
     speed_torques: tuple[Scalar, ...] = table("N m", "resisting torque at these speeds")
+
+    def __post_init__(self):
+        for name in ("positions", "position_torques", "speeds", "speed_torques"):
+            if len(numbers := getattr(self, name)) > _CHAINED_POINTS:
+                setattr(self, name, np.asarray(numbers))
 
     def resist(self, state, motion):
         position = motion.position
@@ -41,10 +50,15 @@ class Tabulated(SideEffect):
         return ""
 
 
-def _interpolate(x: Number, points: Sequence[Scalar], torques: Sequence[Scalar]) -> Number:
-    """Interpolate linearly between points; 0 without points. It has no arrays, which not every compiled loop can index."""
-    if not points:
+def _interpolate(x: Number, points: Any, torques: Any) -> Number:
+    """Interpolate linearly between points; 0 without points. A long table is an array, which not every loop can index."""
+    if not len(points):
         return 0.0
+    if not isinstance(points, tuple):
+        points, torques = jnp.asarray(points), jnp.asarray(torques)
+        i = jnp.searchsorted(points[1:-1], x, side="right", method="scan_unrolled")
+        width = points[i + 1] - points[i]
+        return torques[i] + (torques[i + 1] - torques[i]) / width * jnp.clip(x - points[i], 0.0, width)
     torque = torques[0]
     for i in range(len(points) - 1):
         width = points[i + 1] - points[i]
