@@ -1,6 +1,6 @@
 """A block to write code for: a state, a step from sample to sample, and names for all inputs and outputs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -43,6 +43,22 @@ class StudyNumber(NamedTuple):
     description: str
 
 
+class Reference(NamedTuple):
+    """What a position is counted from where numbers are too short for many turns.
+
+    Attributes:
+        inputs: names of the inputs that are counted from it; the first one's estimate is the output `{input}_estimate`.
+        name: of the reference.
+        states: names of the states that are this position, too.
+        step: rad; references of all positions move together, each by as many of its steps.
+    """
+
+    inputs: Sequence[str]
+    name: str
+    states: Collection[str]
+    step: float
+
+
 class Block(NamedTuple):
     """Two traced functions of scalars, in one precision.
 
@@ -56,6 +72,7 @@ class Block(NamedTuple):
         start: study numbers, start inputs -> state, and the outputs before the first step if `start_gives_outputs`.
         step: study numbers, state, inputs -> state, outputs.
         start_gives_outputs: True if `start` gives outputs, too.
+        references: of positions that may all move by a step, without a change of what else there is.
     """
 
     name: str
@@ -68,6 +85,7 @@ class Block(NamedTuple):
     start: ClosedJaxpr
     step: ClosedJaxpr
     start_gives_outputs: bool = False
+    references: Sequence[Reference] = ()
 
 
 Values = dict[str, Any]

@@ -1,5 +1,6 @@
 """The chain that runs in real time beside a drive: observers, equivalent control, identifier, controller, as one block."""
 
+import math
 from typing import Any
 
 import jax
@@ -11,10 +12,12 @@ from jaxbl.config import Config
 from jaxbl.control import Target
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
 
-from .block import Block, Outputs, Port, StudyNumber, Values, trace_block
+from .block import Block, Outputs, Port, Reference, StudyNumber, Values, trace_block
 from .lowering import default_precision
 
 PERIOD = "run.sample_period"
+_LARGEST_STEP = 64.0
+"""Largest step of a reference, rad: floats there are 4e-6 rad apart, a small part of an encoder's count."""
 LAST_SAMPLE = np.iinfo(np.int32).max
 """Largest index of a sample."""
 
@@ -99,7 +102,27 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         samples = jnp.where(state.samples == LAST_SAMPLE, LAST_SAMPLE - LONGEST_BLOCK, state.samples) + 1
         return _ChainState(**vars(compensated), samples=samples, missed=counts), out
 
-    return trace_block(name, dtype, study_numbers, positions, [torque, *positions, *targets], start, sample)
+    block = trace_block(name, dtype, study_numbers, positions, [torque, *positions, *targets], start, sample)
+
+    def begin(unit: float) -> Any:
+        numbers = {path: jnp.asarray(number.value, dtype) for path, number in study_numbers.items()}
+        inputs = {position.name: jnp.asarray(i * unit, dtype) for i, position in enumerate(positions, 1)}
+        return np.array([*map(float, jax.tree.leaves(jax.jit(start)(numbers, inputs)))])
+
+    with default_precision(dtype):
+        # a state that is a position begins with the first one
+        sources = np.rint(begin(1.0) - begin(0.0))
+    drive, references = config.build().drive, []
+    # a power of two for the last side, and what belongs to it for the others
+    shares = [float(drive.ratio(sides[-1])) / float(drive.ratio(side)) for side in sides]
+    step_size = 2.0 ** math.floor(math.log2(_LARGEST_STEP / max(shares)))
+    for i, (position, share) in enumerate(zip(positions, shares, strict=True), 1):
+        states = {state.name for state, source in zip(block.state, sources, strict=True) if source == i}
+        inputs = [position.name]
+        if experiment.controller is not None and position.name == f"{experiment.controller.side}_position":
+            inputs.append(targets[0].name)
+        references.append(Reference(inputs, f"{position.name}_reference", states, step_size * share))
+    return block._replace(references=references)
 
 
 def read_study_numbers(experiment: Experiment) -> dict[str, StudyNumber]:

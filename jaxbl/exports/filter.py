@@ -13,11 +13,15 @@ def input_columns(program: Program) -> list[str]:
     return ["t", *(channels.get(port.name, port.name) for port in program.block.inputs)]
 
 
+_PRINTED = {"double": ("%.17g", ""), "float": ("%.9g", "(double)")}
+_READ = {"double": "", "float": "(float)"}
+"""How numbers of a type are printed and read as double."""
+
+
 def write_filter_code(program: Program) -> str:
     """Write the program, which reads columns `t,u,theta_e,theta_s` (`t,u,theta_e` of a rigid drive), and with a controller
     those of its target."""
     block, name = program.block, program.block.name
-    real, single = c_type(block.dtype), c_type(block.dtype) == "float"
     csv_columns = input_columns(program)
     column_list = ",".join(csv_columns)
     remarks = [
@@ -29,14 +33,13 @@ def write_filter_code(program: Program) -> str:
         "",
         "Lines have to come at the sampling period; times are only copied. A first line without numbers is passed over.",
     ]
-    real_format, cast = ("%.9g", "(double)") if single else ("%.17g", "")
-    names, formats, printed = ["t"], [real_format], [f"{cast}row[0]"]
+    names, formats, printed = ["t"], ["%.17g"], ["row[0]"]
     for output in block.outputs:
-        is_whole = output.dtype.kind in "bi"
+        number_format, cast = _PRINTED.get(c_type(output.dtype), ("%d", "(int)"))
         names.append(output.name)
-        formats.append("%d" if is_whole else real_format)
-        printed.append(f"{'(int)' if is_whole else cast}outputs.{output.name}")
-    places = {port.name: f"row[{1 + i}]" for i, port in enumerate(block.inputs)}
+        formats.append(number_format)
+        printed.append(f"{cast}outputs.{output.name}")
+    places = {port.name: f"{_READ[c_type(port.dtype)]}row[{i}]" for i, port in enumerate(block.inputs, 1)}
     return f'''{write_comment(C_MARKS, *remarks)}
 
 #include <stdio.h>
@@ -49,14 +52,14 @@ def write_filter_code(program: Program) -> str:
 #define LONGEST 1024
 
 /* The numbers of a line; 0 where there are not {len(csv_columns)}. */
-static int numbers(const char *line, {real} row[COLUMNS])
+static int numbers(const char *line, double row[COLUMNS])
 {{
     const char *at = line;
     int i;
     for (i = 0; i < COLUMNS; i++)
     {{
         char *end = NULL;
-        row[i] = {"strtof" if single else "strtod"}(at, &end);
+        row[i] = strtod(at, &end);
         if (end == at)
         {{
             return 0;
@@ -80,7 +83,7 @@ int main(int argc, char *argv[])
     static {name}_state state;
     {name}_outputs outputs;
     char line[LONGEST];
-    {real} row[COLUMNS];
+    double row[COLUMNS];
     unsigned long count = 0ul;
     int started = 0;
     FILE *in = (argc > 1) ? fopen(argv[1], "r") : stdin;

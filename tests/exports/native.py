@@ -13,6 +13,7 @@ from jaxbl.files import read_result
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wdouble-promotion", "-Wconversion", "-Werror")
 UNCONTRACTED = ("-ffp-contract=off",)
 _CTYPES = {"float64": ctypes.c_double, "float32": ctypes.c_float, "int32": ctypes.c_int32, "bool": ctypes.c_bool}
+_C_NAMES = {"float64": "double", "float32": "float"}
 
 COMPILERS = [pytest.param(compiler, marks=pytest.mark.program(compiler)) for compiler in ("gcc", "clang")]
 
@@ -26,8 +27,9 @@ def run_program(*command, cwd=None, **options):
 
 def write_harness(summary, header=True):
     """C that runs many samples, with outputs as rows of real numbers."""
-    name, real = summary["name"], summary["precision"]
-    inputs, outputs, first = (len(summary[key]) for key in ("inputs", "outputs", "first"))
+    name, real = summary["name"], "double"
+    inputs, outputs = len(summary["inputs"]), len(summary["outputs"])
+    casts = {key: [f"({_C_NAMES[port['type']]})" for port in summary[key]] for key in ("inputs", "first")}
     return "\n".join(
         [
             f'#include "{name}.h"',
@@ -36,11 +38,11 @@ def write_harness(summary, header=True):
             f"void go({name}_state *s, long n, const {real} *in, {real} *out);",
             f"size_t size_of_state(void) {{ return sizeof({name}_state); }}",
             f"void begin({name}_state *s, const {real} *in)",
-            f"{{ {name}_init(s, {', '.join(f'in[{i}]' for i in range(first))}); }}",
+            f"{{ {name}_init(s, {', '.join(f'{cast}in[{i}]' for i, cast in enumerate(casts['first']))}); }}",
             f"void go({name}_state *s, long n, const {real} *in, {real} *out)",
             f"{{ long i; {name}_outputs o; for (i = 0; i < n; i++) {{",
-            f"  {name}_step(s, {', '.join(f'in[i * {inputs} + {k}]' for k in range(inputs))}, &o);",
-            *(f"  out[i * {outputs} + {k}] = ({real})o.{output['name']};" for k, output in enumerate(summary["outputs"])),
+            f"  {name}_step(s, {', '.join(f'{cast}in[i * {inputs} + {k}]' for k, cast in enumerate(casts['inputs']))}, &o);",
+            *(f"  out[i * {outputs} + {k}] = (double)o.{output['name']};" for k, output in enumerate(summary["outputs"])),
             "} }",
             "",
         ]
@@ -65,17 +67,16 @@ class Native:
         self.size = self._library.size_of_state()
 
     def start(self, first):
-        self._library.begin(
-            ctypes.byref(self.state), np.ascontiguousarray(first, self.dtype).ctypes.data_as(ctypes.c_void_p)
-        )
+        first = np.asarray(first, self.dtype).astype(float)
+        self._library.begin(ctypes.byref(self.state), first.ctypes.data_as(ctypes.c_void_p))
 
     def run(self, inputs):
         """Outputs (samples, outputs) of inputs (samples, inputs)."""
-        inputs = np.ascontiguousarray(inputs, self.dtype)
-        outputs = np.empty((len(inputs), len(self.summary["outputs"])), self.dtype)
+        inputs = np.ascontiguousarray(np.asarray(inputs, self.dtype), float)
+        outputs = np.empty((len(inputs), len(self.summary["outputs"])))
         pointers = (array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, outputs))
         self._library.go(ctypes.byref(self.state), ctypes.c_long(len(inputs)), *pointers)
-        return outputs
+        return outputs.astype(self.dtype)
 
 
 def draw_samples(count, sides, period=1e-3, seed=0):

@@ -283,3 +283,36 @@ def test_another_folder_is_not_overwritten(tmp_path):
     with pytest.raises(InputError, match="is not empty and holds no results"):
         jaxbl.export(study(), tmp_path, name="drive")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.program("gcc")
+@pytest.mark.parametrize("ratio", [5.0, 0.5, 256.9, None])
+@pytest.mark.parametrize("kind", ["super_twisting", "dirty_derivative", "extended_state"])
+def test_in_float_many_turns_away_it_is_as_good_as_near_zero(tmp_path, kind, ratio):
+    """Positions that pass through many turns, and a zero that lies far away; the velocity is that of the code in double."""
+    data, count = study(kind), 4000
+    time = 1e-3 * np.arange(count)
+    motor, ratio = 60.0 * np.sin(3.0 * time) + 0.1 * np.sin(40.0 * time), ratio or 1.0
+    inputs = np.stack([0.1 * np.sin(3.0 * time), motor, motor / ratio], axis=1)
+    data["drive"]["gear_ratio"] = ratio
+    if ratio == 1.0:
+        data.pop("transmission"), data.pop("identifier"), data["observer"].pop("load")
+        data["drive"], inputs = {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.15}, inputs[:, :2]
+    columns = {}
+    for precision in ("double", "float"):
+        native = export_native(tmp_path / precision, data, precision)
+        native.dtype = np.dtype(float)
+        names = [output["name"] for output in native.summary["outputs"]]
+        for turns in (0, -30_000, 10_000_000):
+            away = turns * np.array([0.0, 1.0, 1.0 / ratio])[: inputs.shape[1]]
+            columns[precision, turns] = dict(zip(names, run_native(native, inputs + away).T, strict=True))
+    sides = ("motor", "load")[: inputs.shape[1] - 1]
+    for side, turn in zip(sides, (1.0, 1.0 / ratio), strict=False):
+        for quantity, unit in (("velocity", 0.0), ("position", turn)):
+            found = {
+                (precision, turns): column[f"{side}_{quantity}_estimate"][500:] - turns * unit
+                for (precision, turns), column in columns.items()
+            }
+            errors = {case: np.sqrt(np.mean((values - found["double", 0]) ** 2)) for case, values in found.items()}
+            allowed = 3.0 * errors["float", 0] + 1e-6 * np.ptp(found["double", 0])
+            assert max(errors["float", turns] for turns in (-30_000, 10_000_000)) < allowed
