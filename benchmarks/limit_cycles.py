@@ -1,6 +1,7 @@
 """Limit cycles of closed loops with a gap, beside an independent event-driven simulation.
 
     python benchmarks/limit_cycles.py [--drives 20] [--seed 0]
+    python benchmarks/limit_cycles.py --throughput 10000 2000    # lanes and samples: closed loops over the same in open loop
 
 Drives with a gap under a P-PI cascade, whose position comes from the load, start beside a reference at rest. The other side
 of the comparison is written here with NumPy alone: between samples the drive is linear in contact and in the gap, and is
@@ -12,6 +13,7 @@ third quarter of the run to the last one, or is below a hundredth of the half ga
 
 import argparse
 import dataclasses
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -179,14 +181,52 @@ def is_at_border(loop: Loop, *cycles: Cycle) -> bool:
     return any(c.amplitude < least or abs(c.before / c.amplitude - 1.0) > 0.03 for c in cycles)
 
 
+CHAIN_METRICS = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus")
+LOOP_METRICS = (*CHAIN_METRICS, "following_rmse", "limit_cycle_amplitude", "limit_cycle_frequency")
+"""What is measured in both loops, and in the closed one as well."""
+
+
+def measure_throughput(lanes: int, steps: int, repeats: int = 5) -> None:
+    """Print how fast lanes of one drive with other gaps run in a closed loop and in an open one: the best of some runs."""
+    import jax
+
+    from jaxbl.sweeps.programs import Layout, compile_program
+
+    loop = draw_loop(np.random.default_rng(2))
+    closed = jaxbl.with_values(loop.experiment(), {"encoders.noise": 1e-5})
+    closed = dataclasses.replace(closed, run=dataclasses.replace(closed.run, steps=steps, substeps=10))
+    sine = jaxbl.Sine(0.02 * loop.torque_limit, 1.0)
+    opened = jaxbl.experiment(dataclasses.replace(closed, controller=None, reference=None, excitation=sine))
+    gaps = {"transmission.half_gap": np.geomspace(0.2, 5.0, lanes) * loop.half_gap}
+    cases = {"open": (opened, CHAIN_METRICS), "closed": (closed, CHAIN_METRICS), "closed, cycles": (closed, LOOP_METRICS)}
+    programs = {}
+    for name, (experiment, metrics) in cases.items():
+        programs[name] = compile_program(
+            experiment, Layout(1, lanes), jax.local_devices(), "fused", gaps, metric_names=metrics, require_backend=True
+        )
+    best = dict.fromkeys(cases, np.inf)
+    # in turns, so that other load meets all alike
+    for _ in range(repeats):
+        for name, program in programs.items():
+            start = time.perf_counter()
+            program.run(gaps, np.zeros(1, np.uint32))
+            best[name] = min(best[name], time.perf_counter() - start)
+    for name, seconds in best.items():
+        print(f"{name:15} {lanes * steps / seconds:.3e} lane-steps/s, {best['open'] / seconds:.2f} of the open loop")
+
+
 def main() -> None:
     import jax
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drives", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--throughput", type=int, nargs=2, metavar=("LANES", "SAMPLES"))
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if arguments.throughput:
+        measure_throughput(*arguments.throughput)
+        return
     rng, rows, drawn = np.random.default_rng(arguments.seed), [], 0
     while len(rows) < arguments.drives:
         loop, drawn = draw_loop(rng), drawn + 1
