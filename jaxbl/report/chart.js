@@ -213,29 +213,20 @@ class Chart {
       });
       return cell.every((one, i) => one >= 0 && one < this.cells.size[i]) && this.cells.text(cell) ? { cell, place: value } : null;
     }
-    let found = null, least = 40 * 40;
-    for (const line of this.lines) {
-      let first = 0, last = line.x.length;
-      if (line.sorted) { first = before(line.x, this.plot.posToVal(left - 40, "x")); last = Math.min(before(line.x, this.plot.posToVal(left + 40, "x")) + 2, last); }
-      for (let i = first; i < last; i++) {
-        const [x, y] = this.at(line.x[i], line.y[i]), distance = (x - left) ** 2 + (y - top) ** 2;
-        if (distance < least) [found, least] = [{ line, i }, distance];
-      }
-    }
-    return found;
+    return nearestOf(this.lines, [left, top], 40, (x, y) => this.at(x, y), [-40, 40].map((more) => this.plot.posToVal(left + more, "x")));
   }
   show(found) {
     if (!found || !this.plot) { this.box.hidden = true; return; }
     const { line, i, cell } = found, { over } = this.plot, place = cell ? found.place : [line.x[i], line.y[i]];
-    const say = ({ label, name = label, key, names, unit = "" }, k) => (name ? `${name}: ${names ? names.get(Math.round(place[k])) ?? "" : textBetween(place[k], this.shown[k])} ${unit}`.trim() + (key ? ` [${key}]` : "") : "");
-    const lines = cell ? this.cells.text(cell) : [line.name, ...(line.said?.(i) ?? []), say(this.x, 0), say(this.y, 1)].filter(Boolean);
+    const axes = [this.x, this.y].map((axis, k) => saidOf(axis, place[k], this.shown[k]));
+    const lines = cell ? this.cells.text(cell) : [line.name, ...(line.said?.(i) ?? []), ...axes].filter(Boolean);
     const at = this.at(...place);
     beside(this.box, lines, [at[0] + over.offsetLeft, at[1] + over.offsetTop], this.view);
   }
   listen() {
     const { view } = this;
     let from = null, chosen = null;
-    const place = (event) => { const box = this.plot.over.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+    const place = (event) => placeIn(this.plot.over, event);
     view.addEventListener("pointerdown", (event) => { from = [event.clientX, event.clientY]; });
     view.addEventListener("pointermove", (event) => { if (this.plot && !event.buttons) this.show(this.nearest(place(event))); });
     view.addEventListener("click", (event) => {
@@ -245,11 +236,11 @@ class Chart {
     view.addEventListener("pointerleave", () => this.show(null));
     view.addEventListener("blur", () => { chosen = null; this.show(null); });
     view.addEventListener("keydown", (event) => {
-      const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key] ?? 0, turn = { ArrowUp: 1, ArrowDown: -1 }[event.key] ?? 0, count = this.lines.length;
+      const [step, turn] = STEPS[event.key] ?? [0, 0], count = this.lines.length;
       if (event.key === "0" || event.key === "Escape") this.zoom(null);
-      else if ((step || turn) && this.cells?.move) this.cells.move(step, turn);
+      else if ((step || turn) && this.cells?.move) this.cells.move(step, -turn);
       else if ((step || turn) && count) {
-        const line = chosen ? (chosen.line - turn + count) % count : 0, { length } = this.lines[line].x;
+        const line = chosen ? (chosen.line + turn + count) % count : 0, { length } = this.lines[line].x;
         chosen = { line, i: Math.min(length - 1, Math.max(0, (chosen?.i ?? 0) + (chosen ? step : 0) * Math.max(1, Math.floor(length / 100)))) };
         this.show({ line: this.lines[line], i: chosen.i });
       } else if (event.key === "Enter" && this.picked) { const found = this.cells ? {} : chosen && { line: this.lines[chosen.line], i: chosen.i }; if (found) this.picked(found); }

@@ -2,99 +2,54 @@
 /* Draws lines by uPlot in place of their picture, reads values off other figures, zooms them, and sorts tables. Without it, the
  * page is whole. */
 
-/** An axis of a panel: values at shares of its length, and back. */
-class Axis {
-  constructor(of) {
-    Object.assign(this, of);
-    const map = this.log ? Math.log : (value) => value;
-    [this.low, this.high] = this.ends.map(map);
-    this.map = map;
-  }
-  share(value) { return (this.map(value) - this.low) / (this.high - this.low); }
-  value(share) {
-    const mapped = this.low + share * (this.high - this.low);
-    return this.log ? Math.exp(mapped) : mapped;
-  }
-  text(value) {
-    if (!this.names?.length) return text(value);
-    const near = this.names.reduce((a, b) => (Math.abs(b[0] - value) < Math.abs(a[0] - value) ? b : a));
-    return Math.abs(near[0] - value) <= 0.5 ? near[1] : "";
-  }
-  /** A line of text for a value; none where it has neither a name nor a label. */
-  line(value) {
-    const text = this.text(value);
-    return this.label && text ? [`${this.label}: ${text}${this.key ? ` [${this.key}]` : ""}`] : this.names?.length && text ? [text] : [];
-  }
-}
-
-/** What a panel has at a place: lines of text (of a map, those of the cell), and where the nearest point is (shares of the panel). */
-const found = (panel, at, size) => {
-  const { x, y } = panel, here = [x.value(at[0]), y.value(1 - at[1])];
-  const place = [...x.line(here[0]), ...y.line(here[1])];
-  const bar = panel.bars.find(([left, bottom, width, height]) =>
-    (here[1] - bottom) * (here[1] - bottom - height) <= 0 && (here[0] - left) * (here[0] - left - width) <= 0);
-  if (bar) {
-    const lies = y.names, ends = [bar[0] + (lies ? bar[2] : bar[2] / 2), bar[1] + (lies ? bar[3] / 2 : bar[3])];
-    return { text: lies ? [...y.line(ends[1]), ...x.line(ends[0])] : [...x.line(ends[0]), ...y.line(ends[1])] };
-  }
-  if (panel.cells) {
-    const { edges, values, name } = panel.cells;
-    const index = edges.map((one, i) => {
-      const rising = one[0] <= one[one.length - 1], inside = rising ? one : Float32Array.from(one).reverse();
-      const found = Math.min(before(inside, here[i]), one.length - 2);
-      return here[i] < inside[0] || here[i] > inside[inside.length - 1] ? -1 : rising ? found : one.length - 2 - found;
-    });
-    if (Math.min(...index) >= 0) {
-      const value = values[index[1] * (edges[0].length - 1) + index[0]];
-      // the point that the cell is drawn around
-      const centre = [x, y].flatMap((axis, i) =>
-        axis.line(axis.value((axis.share(edges[i][index[i]]) + axis.share(edges[i][index[i] + 1])) / 2)));
-      return { text: [`${name}: ${text(value)}`, ...centre] };
-    }
-  }
-  let best = null, least = 30 * 30;
-  for (const line of panel.lines) {
-    let first = 0, last = line.x.length;
-    if (line.sorted && !x.log && last > 400) {
-      const reach = (x.high - x.low) * 30 / size[0];
-      first = before(line.x, here[0] - reach);
-      last = Math.min(before(line.x, here[0] + reach) + 2, last);
-    }
-    for (let i = first; i < last; i++) {
-      const shares = [x.share(line.x[i]), 1 - y.share(line.y[i])];
-      const distance = ((shares[0] - at[0]) * size[0]) ** 2 + ((shares[1] - at[1]) * size[1]) ** 2;
-      if (distance < least) { least = distance; best = { line, i, shares }; }
-    }
-  }
-  if (!best) return { text: place };
-  const head = best.line.name ? [best.line.name] : [];
-  const said = [...head, ...x.line(best.line.x[best.i]), ...y.line(best.line.y[best.i])];
-  return { text: said, at: best.shares, colour: best.line.colour };
+/** Shares of an axis's length as values, and back. */
+const along = ({ ends, log }) => {
+  const [map, back] = log ? [Math.log, Math.exp] : [Number, Number], [low, high] = ends.map(map);
+  return { share: (value) => (map(value) - low) / (high - low), value: (share) => back(low + share * (high - low)) };
+};
+/** The cell of a value between edges that rise or fall; -1 outside. */
+const cellOf = (edges, value) => {
+  const falls = edges[0] > edges[edges.length - 1], rising = falls ? edges.toReversed() : edges, last = edges.length - 2, k = Math.min(before(rising, value), last);
+  return value < rising[0] || value > rising[last + 1] ? -1 : falls ? last - k : k;
 };
 
-const unpack = (panels) => panels.map((panel) => ({
-  ...panel,
-  x: new Axis(panel.x),
-  y: new Axis(panel.y),
-  lines: panel.lines.map((line) => ({ ...line, x: unpacked(line.x), y: unpacked(line.y) })),
-  cells: panel.cells && {
-    name: panel.cells.name, edges: [unpacked(panel.cells.x), unpacked(panel.cells.y)], values: unpacked(panel.cells.values),
-  },
-}));
+/** What a panel has at a place, in pixels from its corner: lines of text, and of a point where it is. */
+const found = (panel, at, size) => {
+  const axes = [panel.x, panel.y], [x, y] = axes.map(along), here = [x.value(at[0] / size[0]), y.value(1 - at[1] / size[1])];
+  const said = (values, order = [0, 1]) => order.map((i) => saidOf(axes[i], values[i])).filter(Boolean);
+  const inside = (low, length, value) => (value - low) * (value - low - length) <= 0, lies = panel.y.names;
+  const bar = panel.bars.find(([left, bottom, width, height]) => inside(left, width, here[0]) && inside(bottom, height, here[1]));
+  if (bar) return { text: said([bar[0] + bar[2] / (lies ? 1 : 2), bar[1] + bar[3] / (lies ? 2 : 1)], lies ? [1, 0] : [0, 1]) };
+  if (panel.cells) {
+    const { edges, values, name } = panel.cells, [i, j] = edges.map((one, k) => cellOf(one, here[k]));
+    // the point that the cell is drawn around
+    const centre = () => [[x, edges[0], i], [y, edges[1], j]].map(([axis, one, k]) => axis.value((axis.share(one[k]) + axis.share(one[k + 1])) / 2));
+    if (i >= 0 && j >= 0) return { text: [`${name}: ${text(values[j * (edges[0].length - 1) + i])}`, ...said(centre())] };
+  }
+  const place = (a, b) => [x.share(a) * size[0], (1 - y.share(b)) * size[1]];
+  const near = nearestOf(panel.lines, at, 30, place, [-30, 30].map((more) => x.value((at[0] + more) / size[0])));
+  if (!near) return { text: said(here) };
+  const { line, i } = near, point = [line.x[i], line.y[i]];
+  return { text: [line.name, ...said(point)].filter(Boolean), at: place(...point), colour: line.colour };
+};
 
 const DASHES = { "--": [6, 4], ":": [2, 3], "-.": [8, 4, 2, 4] };
+const black = (colour) => (colour === "#000000" ? undefined : colour);
+const unpack = ({ x, y, lines, cells, bands, spans, ...panel }) => ({
+  ...panel, ...Object.fromEntries([["x", x], ["y", y]].map(([name, { names, ...axis }]) => [name, { ...axis, names: names && new Map(names) }])),
+  lines: lines.map((line) => ({ ...line, x: unpacked(line.x), y: unpacked(line.y), colour: black(line.colour), alpha: line.opacity, dash: DASHES[line.dashes] })),
+  cells: cells && { name: cells.name, edges: [unpacked(cells.x), unpacked(cells.y)], values: unpacked(cells.values) },
+  shades: [...bands.map((band) => ({ ...band, x: unpacked(band.x), low: unpacked(band.low), high: unpacked(band.high) })), ...spans.map((span) => ({ ...span, colour: black(span.colour) ?? GREY }))].map((one) => ({ ...one, alpha: one.opacity })),
+});
+
 const charts = [];
 
 /** A panel of lines as a chart, and what the panel's lines say. */
-const charted = (element, panel, height) => {
-  const axis = ({ names, ends, ...of }) => ({ ...of, ends, names: names && new Map(names) });
-  const black = (colour) => (colour === "#000000" ? undefined : colour);
-  const chart = new Chart(element, { x: axis(panel.x), y: axis(panel.y), height, title: panel.title, named: true, zoomed: (range) => follow(chart, range) });
-  const lines = panel.lines.map((line) => ({ ...line, x: unpacked(line.x), y: unpacked(line.y), colour: black(line.colour), alpha: line.opacity, dash: DASHES[line.dashes] }));
+const charted = (element, { x, y, title, lines, shades }, height) => {
+  const chart = new Chart(element, { x, y, height, title, named: true, zoomed: (range) => follow(chart, range) });
   // of a line with marks the marks are dots of their own
   const dotted = lines.filter((line) => line.marker).map((line) => ({ ...line, dots: line.marker === "." ? 4 : 6 }));
-  const bands = panel.bands.map(({ x, low, high, opacity, ...band }) => ({ ...band, x: unpacked(x), low: unpacked(low), high: unpacked(high), alpha: opacity }));
-  chart.set([...lines.filter((line) => line.width !== 0), ...dotted], [...bands, ...panel.spans.map(({ opacity, dashes, colour, ...span }) => ({ ...span, colour: black(colour) ?? GREY, alpha: opacity }))]);
+  chart.set([...lines.filter((line) => line.width !== 0), ...dotted], shades);
   charts.push(chart);
 };
 /** Charts over the same quantity are enlarged together. */
@@ -109,14 +64,14 @@ const follow = (from, range) => {
 /** One figure: charts of its panels, or its picture with zoom and values. */
 const figure = (element) => {
   const view = element.querySelector(".view"), image = view.querySelector("img"), content = element.querySelector("script");
-  const panels = JSON.parse(content.textContent), tools = made("div", { className: "tools" });
+  const panels = JSON.parse(content.textContent).map(unpack), tools = made("div", { className: "tools" });
   const tool = (label, textContent, act) => {
     const button = made("button", { type: "button", textContent, title: label, ariaLabel: label });
     button.addEventListener("click", act);
     tools.append(button);
   };
   // signals; what is written into other figures, such as names beside their curves, is in the picture alone
-  const isSignal = (panel) => panel.bands && !panel.cells && !panel.bars.length && !panel.x.log && panel.lines.length && panel.lines.every((line) => line.sorted);
+  const isSignal = (panel) => !panel.cells && !panel.bars.length && !panel.x.log && panel.lines.length && panel.lines.every((line) => line.sorted);
   if (panels.length && panels.every(isSignal)) {
     const height = Number(image.getAttribute("height"));
     image.hidden = true;
@@ -128,102 +83,83 @@ const figure = (element) => {
       row.forEach((panel, k) => charted(across.children[k], panel, Math.max(130, panel.place[3] * height + 45)));
     }
     tool("whole figure", "whole", () => { for (const chart of charts) if (view.contains(chart.view)) chart.zoom(null); });
-  } else pictured(view, image, unpack(panels), tool, tools);
+  } else pictured(element, view, image, panels, tool, tools);
   tool("save as SVG", "SVG", () => made("a", { href: image.src, download: `${element.dataset.name}.svg` }).click());
   view.after(tools);
 };
 
-/** Zoom and values of a picture. */
-const pictured = (view, image, panels, tool, tools) => {
-  const marker = made("div", { className: "marker", hidden: true }), values = made("div", { className: "values", hidden: true });
-  view.append(marker, values);
-  let scale = 1, shift = [0, 0], from = null, cursor = null;
+/** Zoom and values of a picture, which is enlarged within its view. */
+const pictured = (element, view, image, panels, tool, tools) => {
+  const marker = made("div", { className: "marker", hidden: true }), values = made("div", { className: "values", hidden: true }), spoken = made("span", { className: "spoken", ariaLive: "polite" });
+  let scale = 1, cursor = null;
+  element.append(marker, values);
+  view.style.aspectRatio = image.getAttribute("width") / image.getAttribute("height");
+  image.draggable = false;
+  const size = () => [view.clientWidth, view.clientHeight], shift = () => [view.scrollLeft, view.scrollTop];
   const hide = () => { marker.hidden = values.hidden = true; };
-  const draw = () => {
-    const { clientWidth: width, clientHeight: height } = view;
-    shift = [Math.min(0, Math.max(shift[0], width * (1 - scale))), Math.min(0, Math.max(shift[1], height * (1 - scale)))];
-    image.style.transform = scale === 1 ? "" : `translate(${shift[0]}px, ${shift[1]}px) scale(${scale})`;
+  const move = (across, down) => { view.scrollBy(across, down); hide(); };
+  const zoom = (factor, at = size().map((one) => one / 2)) => {
+    const next = Math.min(20, Math.max(1, scale * factor)), to = shift().map((one, i) => (one + at[i]) * next / scale - at[i]);
+    scale = next;
+    image.style.width = scale === 1 ? "" : `${100 * scale}%`;
     view.classList.toggle("zoomed", scale > 1);
+    view.scrollTo(...to);
     hide();
   };
-  const zoom = (factor, at = [view.clientWidth / 2, view.clientHeight / 2]) => {
-    const next = Math.min(20, Math.max(1, scale * factor));
-    shift = shift.map((one, i) => at[i] - (at[i] - one) * next / scale);
-    scale = next;
-    draw();
-  };
   const show = (at) => {
-    const width = view.clientWidth * scale, height = view.clientHeight * scale;
-    const share = [(at[0] - shift[0]) / width, (at[1] - shift[1]) / height];
-    const panel = panels.find(({ place: [left, top, wide, high] }) => share[0] >= left && share[0] <= left + wide && share[1] >= top && share[1] <= top + high);
+    const whole = size().map((one) => one * scale), here = shift().map((one, i) => one + at[i]);
+    const inside = ({ place }) => here.every((one, i) => one >= place[i] * whole[i] && one <= (place[i] + place[i + 2]) * whole[i]), panel = panels.find(inside);
     if (!panel) return hide();
-    const [left, top, wide, high] = panel.place, here = found(panel, [(share[0] - left) / wide, (share[1] - top) / high], [wide * width, high * height]);
-    beside(values, here.text, at, view);
-    marker.hidden = !here.at;
-    if (here.at) Object.assign(marker.style, { left: `${(left + here.at[0] * wide) * width + shift[0]}px`, top: `${(top + here.at[1] * high) * height + shift[1]}px`, borderColor: here.colour });
+    const corner = whole.map((one, i) => panel.place[i] * one), there = found(panel, here.map((one, i) => one - corner[i]), whole.map((one, i) => panel.place[i + 2] * one));
+    beside(values, there.text, at, view);
+    marker.hidden = !there.at;
+    const [left, top] = there.at?.map((one, i) => `${one + corner[i] - shift()[i]}px`) ?? [];
+    if (there.at) Object.assign(marker.style, { left, top, borderColor: there.colour });
   };
-  const place = (event) => {
-    const box = view.getBoundingClientRect();
-    return [event.clientX - box.left, event.clientY - box.top];
-  };
-  view.addEventListener("pointermove", (event) => {
-    if (!from) return show(place(event));
-    const at = place(event);
-    shift = shift.map((one, i) => one + at[i] - from[i]);
-    from = at;
-    draw();
-  });
-  view.addEventListener("pointerdown", (event) => { if (scale > 1) { from = place(event); view.setPointerCapture(event.pointerId); } });
-  for (const name of ["pointerup", "pointercancel"]) view.addEventListener(name, () => { from = null; });
+  view.addEventListener("pointermove", (event) => { if (event.buttons && scale > 1) move(-event.movementX, -event.movementY); else show(placeIn(view, event)); });
+  view.addEventListener("pointerdown", (event) => { if (scale > 1) view.setPointerCapture(event.pointerId); });
   view.addEventListener("pointerleave", hide);
-  view.addEventListener("dblclick", (event) => zoom(scale > 1 ? 1 / scale : 3, place(event)));
+  view.addEventListener("dblclick", (event) => zoom(scale > 1 ? 1 / scale : 3, placeIn(view, event)));
   view.addEventListener("wheel", (event) => {
     // the page scrolls, unless the figure is meant
     if (!event.ctrlKey && scale === 1) return;
     event.preventDefault();
-    zoom(Math.exp(-event.deltaY / 300), place(event));
+    zoom(Math.exp(-event.deltaY / 300), placeIn(view, event));
   }, { passive: false });
-  const spoken = made("span", { className: "spoken", ariaLive: "polite" });
   // by keyboard: arrows move a cross-hair over the figure, or the figure where it is zoomed
   view.addEventListener("keydown", (event) => {
-    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    const step = STEPS[event.key];
     if (event.key === "+" || event.key === "-") zoom(event.key === "+" ? 1.5 : 1 / 1.5);
     else if (event.key === "0") zoom(1 / scale);
     else if (event.key === "Escape") { cursor = null; hide(); }
-    else if (step && event.shiftKey) { shift = shift.map((one, i) => one - 40 * step[i]); draw(); }
+    else if (step && event.shiftKey) move(40 * step[0], 40 * step[1]);
     else if (step) {
-      const size = [view.clientWidth, view.clientHeight];
-      cursor = (cursor ?? size.map((one) => one / 2)).map((one, i) => Math.min(size[i], Math.max(0, one + 8 * step[i])));
+      const most = size();
+      cursor = (cursor ?? most.map((one) => one / 2)).map((one, i) => Math.min(most[i], Math.max(0, one + 8 * step[i])));
       show(cursor);
       spoken.textContent = values.hidden ? "" : values.textContent;
     } else return;
     event.preventDefault();
   });
   view.addEventListener("blur", () => { cursor = null; hide(); });
-  for (const [label, sign, act] of [["zoom in", "+", () => zoom(1.5)], ["zoom out", "−", () => zoom(1 / 1.5)], ["whole figure", "whole", () => zoom(1 / scale)]]) tool(label, sign, act);
+  for (const [label, sign, factor] of [["zoom in", "+", 1.5], ["zoom out", "−", 1 / 1.5], ["whole figure", "whole", 0]]) tool(label, sign, () => zoom(factor));
   tools.append(spoken);
 };
 
-/** A table that sorts by the column whose head is clicked. */
+/** A table that sorts by the column whose head is clicked: numbers first, then words, then what is no number. */
 const sortable = (table) => {
-  const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
+  const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells], rank = (value) => (typeof value === "string" ? 1 : Number.isNaN(value) ? 2 : 0);
   heads.forEach((head, column) => {
     const button = made("button", { type: "button" }, ...head.childNodes);
     if (!button.textContent.trim()) return;
     head.append(button);
+    const key = ({ cells: { [column]: { dataset: { value }, textContent } } }) => (value === undefined ? textContent : Number(value));
     button.addEventListener("click", () => {
-      const rising = head.getAttribute("aria-sort") !== "ascending";
+      const rising = head.getAttribute("aria-sort") !== "ascending", sign = rising ? 1 : -1;
       for (const other of heads) other.removeAttribute("aria-sort");
       head.setAttribute("aria-sort", rising ? "ascending" : "descending");
-      const key = (row) => {
-        const cell = row.cells[column];
-        return "value" in cell.dataset ? Number(cell.dataset.value) : cell.textContent;
-      };
-      const rank = (value) => (Number.isNaN(value) ? 2 : typeof value === "number" ? 0 : 1);
-      const rows = [...body.rows].map((row) => [key(row), row]);
-      rows.sort(([a], [b]) => rank(a) - rank(b) ||
-        (rising ? 1 : -1) * (typeof a === "number" ? a - b : String(a).localeCompare(String(b), "en", { numeric: true })));
-      body.append(...rows.map(([, row]) => row));
+      const order = (a, b) => rank(a) - rank(b) || sign * (rank(a) === 1 ? a.localeCompare(b, "en", { numeric: true }) : a - b);
+      body.append(...[...body.rows].map((row) => [key(row), row]).sort(([a], [b]) => order(a, b)).map(([, row]) => row));
     });
   });
 };

@@ -28,6 +28,28 @@ const before = (values, x) => {
   }
   return low;
 };
+/** Of lines, { x, y, sorted } each, the sample that lies nearest to a place and less than so many pixels from it; `place` gives a
+ * sample's pixels, and x of what is sorted lies between `ends`. */
+const nearestOf = (lines, at, reach, place, ends) => {
+  let found = null, least = reach ** 2;
+  for (const line of lines) {
+    const { x, y, sorted } = line, first = sorted ? before(x, ends[0]) : 0, last = sorted ? Math.min(before(x, ends[1]) + 2, x.length) : x.length;
+    for (let i = first; i < last; i++) {
+      const [across, down] = place(x[i], y[i]), distance = (across - at[0]) ** 2 + (down - at[1]) ** 2;
+      if (distance < least) [found, least] = [{ line, i }, distance];
+    }
+  }
+  return found;
+};
+/** What an axis says of a value; nothing where it has neither a name nor a word for it. */
+const saidOf = ({ label, name = label, key, names, unit = "", ends }, value, shown = ends) => {
+  const said = names ? names.get(Math.round(value)) ?? "" : name && textBetween(value, shown);
+  return name && said ? `${name}: ${said} ${unit}`.trim() + (key ? ` [${key}]` : "") : said;
+};
+/** What arrow keys ask for: across and down. */
+const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+/** The place of a pointer in an element. */
+const placeIn = (element, { clientX, clientY }) => { const { left, top } = element.getBoundingClientRect(); return [clientX - left, clientY - top]; };
 /** Puts a box of lines beside a place in a view, inside of it; none hides it. */
 const beside = (box, lines, [x, y], view) => {
   box.hidden = !lines.length;
