@@ -58,41 +58,22 @@ const waiting = new Map();
 /** Called by the scripts that carry a Parquet file for pages opened from disk. */
 globalThis.jaxblBytes = (number, content) => { waiting.get(number)(Uint8Array.from(atob(content), (one) => one.charCodeAt(0))); };
 
-/** The Parquet file beside the page as hyparquet reads it: its length, and bytes from and to. */
-const bytesOf = (about) => {
+/** The Parquet file beside the page as hyparquet reads it; of a page opened from disk, by scripts with a part each. */
+const bytesOf = async ({ bytes: byteLength, script: size }) => {
+  if (location.protocol !== "file:") return hyparquet.asyncBufferFromUrl({ url: "points.parquet", byteLength });
   const kept = new Map();
-  const script = (number) => {
-    if (!kept.has(number)) {
-      kept.set(number, new Promise((resolve, reject) => {
-        waiting.set(number, resolve);
-        const element = made("script", { src: `points.${String(number).padStart(4, "0")}.js`, onerror: () => reject(new Error(`${element.src} is missing`)) });
-        document.head.append(element);
-      }));
-    }
-    return kept.get(number);
-  };
-  const fromScripts = async (start, end) => {
-    const first = Math.floor(start / about.script), last = Math.floor((end - 1) / about.script);
-    const parts = await Promise.all(Array.from({ length: last - first + 1 }, (_, i) => script(first + i)));
-    const out = new Uint8Array(end - start);
-    parts.forEach((part, i) => {
-      const begin = (first + i) * about.script, from = Math.max(start, begin), to = Math.min(end, begin + part.length);
-      out.set(part.subarray(from - begin, to - begin), from - start);
-    });
+  const part = (number) => new Promise((resolve, reject) => {
+    waiting.set(number, resolve);
+    const element = made("script", { src: `points.${String(number).padStart(4, "0")}.js`, onerror: () => reject(new Error(`${element.src} is missing`)) });
+    document.head.append(element);
+  });
+  const slice = async (start, end = byteLength) => {
+    const first = Math.floor(start / size), out = new Uint8Array(end - start);
+    for (let i = first; i * size < end; i++) if (!kept.has(i)) kept.set(i, part(i));
+    for (let i = first; i * size < end; i++) out.set((await kept.get(i)).subarray(Math.max(start - i * size, 0), end - i * size), Math.max(i * size - start, 0));
     return out.buffer;
   };
-  let whole = null;
-  const byRange = async (start, end) => {
-    if (whole) return (await whole).slice(start, end);
-    const answer = await fetch("points.parquet", { headers: { Range: `bytes=${start}-${end - 1}` } });
-    if (!answer.ok) throw new Error(`points.parquet: ${answer.status} ${answer.statusText}`);
-    if (answer.status === 206) return answer.arrayBuffer();
-    // some servers send the whole file, which is enough once
-    whole ??= answer.arrayBuffer();
-    return (await whole).slice(start, end);
-  };
-  const slice = location.protocol === "file:" ? fromScripts : byRange;
-  return { byteLength: about.bytes, slice: (start, end = about.bytes) => slice(start, end) };
+  return { byteLength, slice };
 };
 
 /** Columns of the Parquet file beside the page, each read when it is asked for. */
@@ -110,18 +91,14 @@ class Columns {
     return this.kept.get(name);
   }
   async read(name, Kind) {
-    this.metadata ??= hyparquet.parquetMetadataAsync(this.file);
-    const metadata = await this.metadata, out = new Kind(this.rows);
+    const file = await this.file, metadata = await (this.metadata ??= hyparquet.parquetMetadataAsync(file)), out = new Kind(this.rows);
     let rowStart = 0;
     for (const group of metadata.row_groups) {
       const rowEnd = rowStart + Number(group.num_rows);
       // the page stays alive
       await new Promise((resolve) => setTimeout(resolve));
       this.told(name, rowStart / this.rows);
-      await hyparquet.parquetRead({
-        file: this.file, metadata, columns: [name], rowStart, rowEnd,
-        onChunk: ({ columnData, rowStart: first }) => out.set(columnData, first),
-      });
+      await hyparquet.parquetRead({ file, metadata, columns: [name], rowStart, rowEnd, onChunk: (chunk) => out.set(chunk.columnData, chunk.rowStart) });
       rowStart = rowEnd;
     }
     return out;
@@ -176,11 +153,9 @@ class Scale {
 /** A canvas of one pixel a cell, [red, green, blue, opacity] by the cell's number, rows upwards; null leaves it empty. */
 const sheetOf = ([width, height], pixel) => {
   const sheet = made("canvas", { width, height }), image = new ImageData(width, height);
-  for (let j = 0; j < height; j++) {
-    for (let i = 0; i < width; i++) {
-      const colour = pixel(j * width + i);
-      if (colour) image.data.set(colour, 4 * ((height - 1 - j) * width + i));
-    }
+  for (let k = 0; k < width * height; k++) {
+    const colour = pixel(k);
+    if (colour) image.data.set(colour, 4 * ((height - 1 - Math.floor(k / width)) * width + (k % width)));
   }
   sheet.getContext("2d").putImageData(image, 0, 0);
   return sheet;

@@ -3,15 +3,6 @@
 
 const [MOST_FACETS, MOST_DOTS, MOST_PATHS, MOST_ROWS] = [6, 40000, 2000, 60];
 
-/** Rows that a view shows, at most so many, by a function that says whether a row is shown. */
-const some = (study, mask, most, shown = () => true) => {
-  const rows = [], count = mask ? mask.reduce((sum, one) => sum + one, 0) : study.rows;
-  // the first points of a design cover its ranges evenly
-  const every = study.sampled ? 1 : Math.max(1, Math.ceil(count / most));
-  for (let row = 0, passed = 0; row < study.rows && rows.length < most; row++) if ((!mask || mask[row]) && passed++ % every === 0 && shown(row)) rows.push(row);
-  return { rows, count };
-};
-
 /** Colours of a metric, or of another field. */
 const scaleOf = (study, name, values, log) => {
   const { label, unit, names, yes } = study.fields.get(name);
@@ -20,9 +11,37 @@ const scaleOf = (study, name, values, log) => {
   return Scale.of(positive.length ? positive : values, { colours: study.colours, label, unit: study.fields.get(name).metric ? unit : "", names, ...(yes ? { low: 0, high: 1 } : {}), ...(log && !yes && !names ? (factor && positive.length ? { log: true } : {}) : { log: false }) });
 };
 
-/** Maps of a metric over two axes of a grid: one, or one of each value of a third axis. */
-class Maps {
+/** What the three ways to show a study share. */
+class View {
   constructor(page) { Object.assign(this, { page, study: page.study, panels: [] }); }
+  /** Rows that pass the filter, at most so many, by a function that says whether a row is shown; and how many pass. */
+  rows(mask, most, shown = () => true) {
+    const { study } = this, rows = [], count = mask ? mask.reduce((sum, one) => sum + one, 0) : study.rows;
+    // the first points of a design cover its ranges evenly
+    const every = study.sampled ? 1 : Math.max(1, Math.ceil(count / most));
+    for (let row = 0, passed = 0; row < study.rows && rows.length < most; row++) if ((!mask || mask[row]) && passed++ % every === 0 && shown(row)) rows.push(row);
+    return { rows, count, said: rows.length < count ? `${rows.length} of ${count} points are drawn.` : "" };
+  }
+  /** Empty figures below the bar of the colours, as high as the window has room for. */
+  figures(scale, count = 1) {
+    const all = Array.from({ length: count }, () => made("figure"));
+    scale.draw($("bar"));
+    $("plot").className = count > 1 ? "plots several" : "plots";
+    $("plot").replaceChildren(...all);
+    this.height = count > 1 ? 250 : Math.max(300, Math.min(560, innerHeight - $("plot").getBoundingClientRect().top - scrollY - 60));
+    return all;
+  }
+  /** Marks the chosen row, by its place. */
+  mark() {
+    const { row } = this.page.view;
+    this.chart.marks = row === "" ? [] : this.places(Number(row)).map((place) => [...place, "ring"]);
+    this.chart.draw();
+  }
+  shows() { return () => true; }
+}
+
+/** Maps of a metric over two axes of a grid: one, or one of each value of a third axis. */
+class Maps extends View {
   get view() {
     const { view, study } = this.page, [x, y] = ["x", "y"].map((name) => study.dims.find((dim) => dim.path === view[name]) ?? study.dims[study.start[name]]);
     // an address may have anything
@@ -86,18 +105,14 @@ class Maps {
     return { title, x: a.map((one) => x.place(one)), y: b.map((one) => y.place(one)) };
   }
   draw(panels) {
-    const { study, page } = this, { metric, log } = page.view, element = $("plot"), { facet } = this.view, several = panels.length > 1;
-    const scale = (this.scale = scaleOf(study, metric, panels.length > 1 ? panels.flatMap(({ shown }) => [...shown.values]) : [...panels[0].shown.values], log !== "linear"));
-    scale.draw($("bar"));
-    element.replaceChildren();
-    element.className = several ? "plots several" : "plots";
+    const { study, page } = this, { metric, log } = page.view, { facet } = this.view, several = panels.length > 1;
+    const scale = (this.scale = scaleOf(study, metric, panels.flatMap(({ shown }) => [...shown.values]), log !== "linear")), figures = this.figures(scale, panels.length);
     this.stars = [];
-    this.panels = panels.map((panel) => {
-      const { view, shown: { values, cells, step, out }, failed, curve } = panel, { x, y, from, to } = view, figure = made("figure");
-      element.append(figure);
+    this.panels = panels.map((panel, number) => {
+      const { view, shown: { values, cells, step, out }, failed, curve } = panel, { x, y, from, to } = view;
       const ends = [[x, 0], [y, 1]].map(([dim, i]) => [dim.edge(from[i] - 0.5), dim.edge(to[i] - 0.5)]);
-      const chart = new Chart(figure, {
-        x: { ...x.axis, ends: ends[0] }, y: { ...y.axis, ends: ends[1] }, height: several ? 250 : Math.max(300, Math.min(560, innerHeight - element.getBoundingClientRect().top - scrollY - 60)), scale,
+      const chart = new Chart(figures[number], {
+        x: { ...x.axis, ends: ends[0] }, y: { ...y.axis, ends: ends[1] }, height: this.height, scale,
         title: several ? `${facet.name} = ${facet.said(view.at[facet.i])}` : "",
         zoomed: (range) => page.change({ region: range ? [0, 1].flatMap((end) => [x, y].map((dim, i) => (range[i] ? dim.index(range[i][end]) + end : [from, to][end][i]))).join("~") : "" }),
         picked: (found) => { const cell = found.place ? [x.index(found.place[0]), y.index(found.place[1])] : this.cursor?.cell; if (cell) page.take(this.row(view, cell)); },
@@ -131,10 +146,10 @@ class Maps {
     this.mark();
   }
   row({ x, y, at }, cell) { return this.study.dims.reduce((sum, dim) => sum + dim.stride * (dim === x ? cell[0] : dim === y ? cell[1] : at[dim.i] === "all" ? 0 : at[dim.i]), 0); }
-  places(row) { return this.study.dims.map((dim) => Math.floor(row / dim.stride) % dim.size); }
+  indices(row) { return this.study.dims.map((dim) => Math.floor(row / dim.stride) % dim.size); }
   /** The chosen point in all maps, strongest where it lies; the star; the keyboard's cell. */
   mark() {
-    const { row } = this.page.view, at = row === "" ? null : this.places(Number(row));
+    const { row } = this.page.view, at = row === "" ? null : this.indices(Number(row));
     for (const { chart, view, star } of this.panels) {
       const { x, y } = view, here = at && this.study.dims.every((dim) => dim === x || dim === y || view.at[dim.i] === "all" || view.at[dim.i] === at[dim.i]);
       chart.marks = [...(at ? [[x.edge(at[x.i]), y.edge(at[y.i]), here ? "ring" : "ghost"]] : []),
@@ -152,7 +167,7 @@ class Maps {
   }
   /** Lines over each axis, through a row. */
   cuts(row) {
-    const { study, view, page: { view: { metric } } } = this, at = this.places(row), figures = [made("figure"), made("figure")];
+    const { study, view, page: { view: { metric } } } = this, at = this.indices(row), figures = [made("figure"), made("figure")];
     $("cuts").append(...figures);
     return ["x", "y"].map((name, i) => {
       const dim = view[name], from = [at[view.x.i], at[view.y.i]].with(i, 0), to = [at[view.x.i] + 1, at[view.y.i] + 1].with(i, dim.size);
@@ -167,8 +182,7 @@ class Maps {
 }
 
 /** Points over any two axes or metrics, coloured by a third. */
-class Dots {
-  constructor(page) { Object.assign(this, { page, study: page.study }); }
+class Dots extends View {
   form(pick) {
     const { view, study } = this.page, all = [...study.fields.values()].filter((one) => one.metric || one.varied).map((one) => [one.name, one.metric ? one.label : one.name]);
     return [pick("colours", "metric", all, view.metric), pick("x", "px", all, view.px, (px) => ({ px, range: "" })), pick("y", "py", all, view.py, (py) => ({ py, range: "" }))];
@@ -180,27 +194,19 @@ class Dots {
   async update(mask, current) {
     const { page, study } = this, { metric, px, py, log } = page.view, names = [px, py, metric], read = await Promise.all(names.map((name) => study.fields.get(name).read()));
     if (!current()) return "";
-    const { rows, count } = some(study, mask, MOST_DOTS), [x, y, shade] = read.map((one) => rows.map(one));
+    const { rows, said } = this.rows(mask, MOST_DOTS), [x, y, shade] = read.map((one) => rows.map(one));
     const axis = (name, values) => { const field = study.fields.get(name), [low, high] = endsOf([values], true); return { ...field, unit: "", key: field.metric ? "" : name, log: log !== "linear" && !field.names && values.every((one) => !(one <= 0)) && (Boolean(field.log) || high / low > 30) }; };
-    const field = study.fields.get(metric), figure = made("figure");
-    $("plot").className = "plots";
-    $("plot").replaceChildren(figure);
-    const scale = scaleOf(study, metric, shade, log !== "linear"), chart = new Chart(figure, {
-      x: axis(px, x), y: axis(py, y), height: Math.max(300, Math.min(560, innerHeight - figure.getBoundingClientRect().top - scrollY - 60)), scale,
+    const field = study.fields.get(metric), scale = scaleOf(study, metric, shade, log !== "linear"), [figure] = this.figures(scale), chart = new Chart(figure, {
+      x: axis(px, x), y: axis(py, y), height: this.height, scale,
       zoomed: (range) => page.change({ range: range ? range.flatMap((one) => one ?? ["", ""]).join("~") : "" }), picked: ({ i }) => page.take(rows[i]),
     });
-    scale.draw($("bar"));
     Object.assign(this, { chart, read });
     chart.range = this.range.map((one) => one ?? null);
     chart.set([{ name: "", x, y, shade, dots: rows.length > 5000 ? 3 : 6, said: (i) => [`${field.label}: ${text(field.names?.[shade[i]] ?? shade[i])}`] }]);
     this.mark();
-    return rows.length < count ? `${rows.length} of ${count} points are drawn.` : "";
+    return said;
   }
-  mark() {
-    const { row } = this.page.view;
-    this.chart.marks = row === "" ? [] : [[this.read[0](Number(row)), this.read[1](Number(row)), "ring"]];
-    this.chart.draw();
-  }
+  places(row) { return [[this.read[0](row), this.read[1](row)]]; }
   shows() {
     const { range, read } = this;
     return (row) => range.every((ends, i) => !ends || (read[i](row) >= ends[0] && read[i](row) <= ends[1]));
@@ -208,8 +214,7 @@ class Dots {
 }
 
 /** A line for each point over parallel axes; a drag along one of them adds to the filter. */
-class Parallel {
-  constructor(page) { Object.assign(this, { page, study: page.study }); }
+class Parallel extends View {
   form(pick) { return [pick("metric", "metric", this.study.metrics.map((one) => [one.name, one.label]), this.page.view.metric)]; }
   /** The axes: what varies, the metric, and what else tells whether a run is good. */
   fields() {
@@ -219,14 +224,12 @@ class Parallel {
   async update(mask, current) {
     const { page, study } = this, fields = this.fields(), read = await Promise.all(fields.map((one) => one.read()));
     if (!current()) return "";
-    const { rows, count } = some(study, mask, MOST_PATHS), values = read.map((one) => rows.map(one)), log = page.view.log !== "linear";
+    const { rows, said } = this.rows(mask, MOST_PATHS), values = read.map((one) => rows.map(one)), log = page.view.log !== "linear";
     const axes = values.map((column, k) => {
       const [low, high] = endsOf([column]), scaled = log && low > 0 && high / low > 30 && !fields[k].names, map = scaled ? Math.log : (one) => one, length = map(high) - map(low) || 1;
       return { low, high, share: (one) => (map(one) - map(low)) / length, value: (share) => { const one = map(low) + share * length; return scaled ? Math.exp(one) : one; } };
     });
-    const last = fields.findIndex((one) => one.name === page.view.metric), figure = made("figure"), scale = scaleOf(study, page.view.metric, values[last], log), words = (k, one) => fields[k].names?.[Math.round(one)] ?? text(one);
-    $("plot").className = "plots";
-    $("plot").replaceChildren(figure);
+    const last = fields.findIndex((one) => one.name === page.view.metric), scale = scaleOf(study, page.view.metric, values[last], log), [figure] = this.figures(scale), words = (k, one) => fields[k].names?.[Math.round(one)] ?? text(one);
     const chart = (this.chart = new Chart(figure, {
       x: { names: fields.map((one) => one.name.split(".").at(-1)), turn: 25, ends: [-0.4, fields.length - 0.6] }, y: { names: [], ends: [-0.06, 1.06] }, scale, height: 460,
       zoomed: (range) => {
@@ -242,7 +245,6 @@ class Parallel {
         axes.forEach(({ low, high }, k) => { for (const [value, share, side] of [[low, 0, "top"], [high, 1, "bottom"]]) { ctx.textBaseline = side; ctx.fillText(words(k, value), chart.at(k, 0, true)[0], chart.at(0, share, true)[1] + (share ? -3 : 3), bbox.width / fields.length); } });
       },
     }));
-    scale.draw($("bar"));
     // one line of uPlot's for each of some colours, which leaves the window between two points
     const groups = Map.groupBy(rows.keys(), (i) => { const share = scale.share(values[last][i]); return Number.isFinite(share) ? Math.round(20 * Math.min(1, Math.max(0, share))) : -1; });
     chart.set([...groups].map(([share, members]) => {
@@ -257,14 +259,9 @@ class Parallel {
     }));
     Object.assign(this, { axes, read });
     this.mark();
-    return rows.length < count ? `${rows.length} of ${count} points are drawn.` : "";
+    return said;
   }
-  mark() {
-    const { row } = this.page.view;
-    this.chart.marks = row === "" ? [] : this.axes.map(({ share }, k) => [k, share(this.read[k](Number(row))), "ring"]);
-    this.chart.draw();
-  }
-  shows() { return () => true; }
+  places(row) { return this.axes.map(({ share }, k) => [k, share(this.read[k](row))]); }
 }
 
 const KINDS = { map: ["map", Maps], points: ["points", Dots], parallel: ["parallel axes", Parallel] };
@@ -342,7 +339,7 @@ class Page {
     if (large && !$("tabled").open) { $("count").textContent = "Points"; $("tabled").ontoggle = () => this.table(); $("csv").onclick = () => { $("tabled").open = true; }; return; }
     const names = [...new Set([...study.axes.filter((one) => one.varied).map((one) => one.name), view.metric, ...["converged", "margin_exact"].map((one) => `${own}.${one}`).filter((one) => !large && study.metric(one))])];
     const columns = Object.fromEntries(await Promise.all(names.map(async (name) => { const field = study.fields.get(name), read = await field.read(); return [name, { field, read }]; })));
-    const { rows, count } = some(study, mask, large ? 1e5 : 1e6, this.shown.shows()), key = columns[view.metric].read;
+    const { rows, count } = this.shown.rows(mask, large ? 1e5 : 1e6, this.shown.shows()), key = columns[view.metric].read;
     $("state").textContent = this.said;
     const values = Float64Array.from(rows, key), order = Uint32Array.from(rows.keys()).sort((a, b) => (values[a] - values[b]) || (values[a] === values[a] ? -1 : 1) - (values[b] === values[b] ? -1 : 1));
     const cell = ({ field, read }, row) => { const value = read(row); return field.names ? field.names[value] : field.yes ? (value ? "yes" : "no") : value; };
