@@ -63,19 +63,22 @@ const dotsOf = (chart, line) => (plot) => {
  * A line is { name, x, y, colour, alpha, dash, width, dots, shade, sorted, said }; `named` says the lines' names above.
  * Cells, behind the lines, are { x, y, size, colours, text }: ends along both axes, numbers of cells, the canvas of one pixel a
  * cell, and what is said of the cell [i, j], null of none. `scale` has the colours of dots with a shade.
- * `marks`, [x, y, kind] each, are drawn last: "ring", "ghost" or "star". `zoomed` hears ends that are enlarged, null of the whole;
- * `picked` what is clicked: { line, i } or { cell }.
+ * `marks`, [x, y, kind] each, are drawn last: "ring", "ghost" or "star". Charts of a `group` over the same quantity are enlarged
+ * together; `zoomed` hears the ends in place of that, null of the whole. `picked` hears what is clicked: { line, i } or { cell }.
  */
 class Chart {
   constructor(element, { height = 240, caption = "", title = "", ...given }) {
     for (const axis of [given.x, given.y]) if (Array.isArray(axis.names)) axis.names = new Map(axis.names.entries());
-    Object.assign(this, { element, height, lines: [], shades: [], range: null, cells: null, scale: null, marks: [], ...given });
+    Object.assign(this, { element, height, lines: [], shades: [], range: null, cells: null, scale: null, marks: [], group: [], ...given });
+    for (const axis of [this.x, this.y]) axis.name ??= axis.label;
+    this.group.push(this);
     this.box = made("div", { className: "values", hidden: true, ariaLive: "polite" });
     this.view = made("div", { className: "plane", tabIndex: 0 }, this.box);
     this.view.setAttribute("role", "application");
     this.key = made("div");
     element.replaceChildren(...(title ? [made("p", { className: "over", textContent: title })] : []), this.key, this.view, ...(caption ? [made("figcaption", { textContent: caption })] : []));
     this.listen();
+    new ResizeObserver(() => { if (this.plot?.width !== this.view.clientWidth) this.build(); }).observe(this.view);
   }
   /** Lines, and what is shaded behind them: { along, low, high } or { x, low, high } as columns, with { name, colour, alpha }. */
   set(lines, shades = []) {
@@ -130,8 +133,8 @@ class Chart {
     const said = this.scale ? `colours: ${withUnit(this.scale.label, this.scale.unit)}, ${this.scale.said}` : this.lines.map((one) => one.name).filter(Boolean).join(", ");
     this.view.setAttribute("aria-label", `${withUnit(this.y.label ?? "", this.y.unit)} over ${withUnit(this.x.label ?? "", this.x.unit)}, from ${text(ends[1][0])} to ${text(ends[1][1])}: ${said}; arrow keys read values, 0 shows the whole`);
   }
-  /** Draws again: what is marked, or all of it where the window has another size. */
-  draw() { if (this.plot?.width === this.view.clientWidth) this.plot.redraw(false); else this.build(); }
+  /** Draws again, as other points are marked. */
+  draw() { this.plot?.redraw(false); }
   /** The place of a point in the view, or in the canvas, in pixels. */
   at(x, y, canvas = false) { return [this.plot.valToPos(x, "x", canvas), this.plot.valToPos(y, "y", canvas)]; }
   clip({ ctx, bbox }) { ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip(); }
@@ -200,7 +203,12 @@ class Chart {
   zoom(range) {
     this.range = range;
     this.show(null);
-    if (this.zoomed) this.zoomed(range); else this.build();
+    if (this.zoomed) return this.zoomed(range);
+    for (const one of new Set([this, ...this.group])) {
+      if (one !== this && (!this.x.name || one.x.name !== this.x.name || one.x.log !== this.x.log)) continue;
+      if (one !== this) one.range = range && [range[0], null];
+      one.build();
+    }
   }
   /** What lies at a place in pixels of the plotting area: a cell, or the nearest sample, none farther than 40 pixels. */
   nearest([left, top]) {

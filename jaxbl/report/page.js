@@ -46,19 +46,10 @@ const charts = [];
 
 /** A panel of lines as a chart, and what the panel's lines say. */
 const charted = (element, { x, y, title, lines, shades }, height) => {
-  const chart = new Chart(element, { x, y, height, title, named: true, zoomed: (range) => follow(chart, range) });
+  const chart = new Chart(element, { x, y, height, title, named: true, group: charts });
   // of a line with marks the marks are dots of their own
   const dotted = lines.filter((line) => line.marker).map((line) => ({ ...line, dots: line.marker === "." ? 4 : 6 }));
   chart.set([...lines.filter((line) => line.width !== 0), ...dotted], shades);
-  charts.push(chart);
-};
-/** Charts over the same quantity are enlarged together. */
-const follow = (from, range) => {
-  for (const chart of charts) {
-    if (chart !== from && !(chart.x.label && chart.x.label === from.x.label && chart.x.log === from.x.log)) continue;
-    if (chart !== from) chart.range = range && [range[0], null];
-    chart.build();
-  }
 };
 
 /** One figure: charts of its panels, or its picture with zoom and values. */
@@ -166,4 +157,3 @@ const sortable = (table) => {
 
 document.querySelectorAll("figure").forEach(figure);
 document.querySelectorAll("table").forEach((table) => { if (table.tBodies[0].rows.length > 1) sortable(table); });
-addEventListener("resize", () => { for (const chart of charts) chart.draw(); });

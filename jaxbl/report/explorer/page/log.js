@@ -202,7 +202,6 @@ globalThis.jaxblData = async (about) => {
   });
   $("csv").onclick = () => { const [from, to] = rows(), names = ["t", view.x, view.y, ...view.shown]; saveTable("log.csv", Object.fromEntries(names.map((name) => [name, (name === "t" ? time : data[name]).slice(from, to)]))); };
   $("picture").onclick = () => savePicture("log.png", $("drawn"));
-  addEventListener("resize", () => { for (const [plot] of plots) plot.draw(); });
   form();
   await redraw();
 };

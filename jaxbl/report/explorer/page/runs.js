@@ -84,17 +84,16 @@ class Runs {
   }
   /** The runs that are drawn: pinned ones first and thin, so that the newest lies between them and the truth; or what they differ by. */
   draw() {
-    const { newest } = this, range = this.plots.find((one) => one.spec.time)?.range, others = this.all.filter((one) => one !== newest), apart = others.length && $("against").value;
+    const { newest } = this, range = this.group?.[0]?.range, others = this.all.filter((one) => one !== newest), apart = others.length && $("against").value;
     $("apart").hidden = !others.length;
     for (const name of ["runcsv", "runpicture"]) $(name).hidden = false;
     $("pinned").replaceChildren(...this.all.map((one) => this.entry(one)));
     $("traces").replaceChildren();
-    const plots = [];
+    const plots = [], group = (this.group = []);
     const add = (spec, lines) => {
       const figure = made("figure");
       $("traces").append(figure);
-      const plot = new Chart(figure, { height: 128, ...spec, title: apart ? `${spec.title}, pinned less newest` : spec.title, zoomed: (to) => { plot.build(); if (spec.time) this.follow(plot, to); } });
-      plot.spec = spec;
+      const plot = new Chart(figure, { height: 128, ...spec, title: apart ? `${spec.title}, pinned less newest` : spec.title, ...(spec.time ? { group } : {}) });
       if (spec.time && range) plot.range = [range[0], null];
       plots.push([plot, lines]);
     };
@@ -141,13 +140,5 @@ class Runs {
       this.draw();
     });
     return made("li", {}, mark, one.name, " ", pin);
-  }
-  /** All plots over time show what one of them does. */
-  follow(from, range) {
-    for (const plot of this.plots) {
-      if (plot === from || !plot.spec.time) continue;
-      plot.range = range && [range[0], null];
-      plot.build();
-    }
   }
 }

@@ -362,7 +362,7 @@ class Page {
     $("point").onclick = () => saveText("point.toml", this.runs?.newest?.row === Number(view.row) ? this.runs.newest.config : pointText(this.chosen.values, study.effects));
     $("gains").onclick = () => saveText("gains.toml", gainsText(study.gains, this.chosen.values));
     for (const name of ["point", "gains"]) $(name).hidden = !study.effects;
-    addEventListener("resize", () => { this.update(); for (const one of this.runs?.plots ?? []) one.draw(); });
+    addEventListener("resize", () => this.update());
     this.form();
     const first = Object.keys(address.read()).every((name) => ["row", "pins", "how", "condition"].includes(name)) && study.grid;
     if (first) { $("chosen").hidden = !study.stars.length; this.shown.first(); document.body.dataset.drawn = "overview"; }
