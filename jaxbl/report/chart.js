@@ -6,11 +6,7 @@ const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 const GREY = "#8a8d93";
 
 /** Names and colours of lines. */
-const legend = (entries) => made("p", { className: "legend" }, ...entries.map(([name, colour, dashed]) => {
-  const mark = made("span", { className: dashed ? "mark dashed" : "mark" });
-  mark.style.borderTopColor = colour;
-  return made("span", {}, mark, name);
-}));
+const legend = (entries) => made("p", { className: "legend" }, ...entries.map(([name, colour, dashed]) => made("span", {}, markOf(colour, dashed), name)));
 
 /** Least and largest of numbers that are finite, and above 0 where that is asked for. */
 const endsOf = (columns, log = false) => {

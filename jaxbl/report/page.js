@@ -56,11 +56,7 @@ const charted = (element, { x, y, title, lines, shades }, height) => {
 const figure = (element) => {
   const view = element.querySelector(".view"), image = view.querySelector("img"), content = element.querySelector("script");
   const panels = JSON.parse(content.textContent).map(unpack), tools = made("div", { className: "tools" });
-  const tool = (label, textContent, act) => {
-    const button = made("button", { type: "button", textContent, title: label, ariaLabel: label });
-    button.addEventListener("click", act);
-    tools.append(button);
-  };
+  const tool = (label, sign, act) => tools.append(button(sign, act, { title: label, ariaLabel: label }));
   // signals; what is written into other figures, such as names beside their curves, is in the picture alone
   const isSignal = (panel) => !panel.cells && !panel.bars.length && !panel.x.log && panel.lines.length && panel.lines.every((line) => line.sorted);
   if (panels.length && panels.every(isSignal)) {
@@ -141,17 +137,16 @@ const pictured = (element, view, image, panels, tool, tools) => {
 const sortable = (table) => {
   const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells], rank = (value) => (typeof value === "string" ? 1 : Number.isNaN(value) ? 2 : 0);
   heads.forEach((head, column) => {
-    const button = made("button", { type: "button" }, ...head.childNodes);
-    if (!button.textContent.trim()) return;
-    head.append(button);
+    if (!head.textContent.trim()) return;
     const key = ({ cells: { [column]: { dataset: { value }, textContent } } }) => (value === undefined ? textContent : Number(value));
-    button.addEventListener("click", () => {
+    const sort = () => {
       const rising = head.getAttribute("aria-sort") !== "ascending", sign = rising ? 1 : -1;
       for (const other of heads) other.removeAttribute("aria-sort");
       head.setAttribute("aria-sort", rising ? "ascending" : "descending");
       const order = (a, b) => rank(a) - rank(b) || sign * (rank(a) === 1 ? a.localeCompare(b, "en", { numeric: true }) : a - b);
       body.append(...[...body.rows].map((row) => [key(row), row]).sort(([a], [b]) => order(a, b)).map(([, row]) => row));
-    });
+    };
+    head.append(made("button", { type: "button", onclick: sort }, ...head.childNodes));
   });
 };
 

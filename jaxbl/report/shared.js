@@ -6,6 +6,9 @@ const made = (tag, properties = {}, ...children) => {
   one.append(...children);
   return one;
 };
+/** A button, and a line's mark in its colour. */
+const button = (textContent, onclick, more = {}) => made("button", { type: "button", textContent, onclick, ...more });
+const markOf = (colour, dashed) => { const mark = made("span", { className: dashed ? "mark dashed" : "mark" }); mark.style.borderTopColor = colour; return mark; };
 const text = (value) => {
   if (typeof value === "string") return value;
   if (value === null || Number.isNaN(value)) return "none";

@@ -26,11 +26,8 @@ const savePicture = (name, element) => {
   }
   save(name, sheet.toDataURL("image/png"));
 };
-const choose = (label, id, options, chosen, act) => {
-  const select = made("select", { id }, ...options.map(([value, name]) => made("option", { value, textContent: name, selected: String(value) === String(chosen) })));
-  select.addEventListener("change", () => act(select.value));
-  return made("label", {}, label, select);
-};
+const choose = (label, id, options, chosen, act) => made("label", {}, label, made("select", { id, onchange: ({ target }) => act(target.value) },
+  ...options.map(([value, name]) => made("option", { value, textContent: name, selected: String(value) === String(chosen) }))));
 const tableOf = (element, heads, rows) => element.replaceChildren(
   made("thead", {}, made("tr", {}, ...heads.map((textContent) => made("th", { textContent, scope: "col" })))),
   made("tbody", {}, ...rows.map(([first, ...others]) => made("tr", {}, first instanceof Node ? made("td", {}, first) : made("th", { textContent: first, scope: "row" }), ...others.map((textContent) => made("td", { className: "number", textContent }))))),

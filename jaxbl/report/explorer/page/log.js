@@ -5,18 +5,15 @@ const [BINS, CELLS, DOTS] = [60, [48, 32], 3000];
 
 /** Mean over a centred window of samples, taken twice; nan stays nan, and does not enter. */
 const smoothed = (values, width) => {
-  if (width < 2) return values;
-  const half = Math.floor(width / 2);
+  const half = Math.floor(width / 2), sums = new Float64Array(values.length + 1), counts = new Uint32Array(values.length + 1);
   let out = values;
-  for (let pass = 0; pass < 2; pass++) {
-    const sums = new Float64Array(out.length + 1), counts = new Uint32Array(out.length + 1);
-    for (let i = 0; i < out.length; i++) {
-      const known = Number.isFinite(out[i]);
-      sums[i + 1] = sums[i] + (known ? out[i] : 0);
-      counts[i + 1] = counts[i] + known;
-    }
+  for (let pass = 0; pass < 2 && width > 1; pass++) {
+    out.forEach((one, i) => {
+      const known = Number.isFinite(one);
+      [sums[i + 1], counts[i + 1]] = [sums[i] + (known ? one : 0), counts[i] + known];
+    });
     out = out.map((one, i) => {
-      const [first, last] = [Math.max(0, i - half), Math.min(out.length, i + half + 1)];
+      const first = Math.max(0, i - half), last = Math.min(out.length, i + half + 1);
       return Number.isNaN(one) ? NaN : (sums[last] - sums[first]) / (counts[last] - counts[first]);
     });
   }
@@ -31,18 +28,12 @@ const ends = (values, from, to) => {
 /** Means of values in cells over one or two coordinates; nan where fewer than `least` samples are. */
 const means = (values, over, limits, size, from, to, least) => {
   const cells = size.reduce((a, b) => a * b), sums = new Float64Array(cells), counts = new Uint32Array(cells);
+  const place = (k, i) => Math.min(size[k] - 1, Math.floor((size[k] * (over[k][i] - limits[k][0])) / (limits[k][1] - limits[k][0])));
   for (let i = from; i < to; i++) {
-    if (!Number.isFinite(values[i])) continue;
-    let at = 0, scale = 1, inside = true;
-    over.forEach((coordinate, k) => {
-      const place = Math.min(size[k] - 1, Math.floor((size[k] * (coordinate[i] - limits[k][0])) / (limits[k][1] - limits[k][0])));
-      inside &&= place >= 0;
-      at += scale * place;
-      scale *= size[k];
-    });
-    if (!inside) continue;
-    sums[at] += values[i];
-    counts[at]++;
+    const across = place(0, i), up = over.length > 1 ? place(1, i) : 0;
+    if (!Number.isFinite(values[i]) || !(across >= 0 && up >= 0)) continue;
+    sums[across + size[0] * up] += values[i];
+    counts[across + size[0] * up]++;
   }
   return Float32Array.from(sums, (sum, i) => (counts[i] >= least ? sum / counts[i] : NaN));
 };
@@ -85,13 +76,11 @@ globalThis.jaxblData = async (about) => {
         (value) => { view.cutoff = value === "none" ? null : Number(value); }),
     );
     $("lines").replaceChildren(made("legend", { textContent: withUnit(view.group.name, view.group.unit) }), ...view.group.lines.map(({ column, label }) => {
-      const box = made("input", { type: "checkbox", checked: view.shown.includes(column), value: column }), mark = made("span", { className: "mark" });
-      mark.style.borderTopColor = colour(column);
-      box.addEventListener("change", () => {
-        view.shown = view.group.lines.map((one) => one.column).filter((one) => (one === column ? box.checked : view.shown.includes(one)));
+      const onchange = ({ target }) => {
+        view.shown = view.group.lines.map((one) => one.column).filter((one) => (one === column ? target.checked : view.shown.includes(one)));
         redraw();
-      });
-      return made("label", {}, box, " ", mark, label);
+      };
+      return made("label", {}, made("input", { type: "checkbox", checked: view.shown.includes(column), value: column, onchange }), " ", markOf(colour(column)), label);
     }));
   };
 
@@ -180,10 +169,9 @@ globalThis.jaxblData = async (about) => {
   };
   const stop = () => {
     cancelAnimationFrame(playing);
-    playing = null;
-    $("play").textContent = "play";
+    [playing, $("play").textContent] = [null, "play"];
   };
-  $("play").addEventListener("click", () => {
+  $("play").onclick = () => {
     if (playing !== null) return stop();
     $("play").textContent = "pause";
     const [from, to] = rows(), start = view.at >= to - 1 || view.at < from ? from : view.at, began = performance.now();
@@ -193,13 +181,13 @@ globalThis.jaxblData = async (about) => {
       if (at >= to - 1) stop(); else playing = requestAnimationFrame(step);
     };
     playing = requestAnimationFrame(step);
-  });
-  $("moment").addEventListener("input", () => {
+  };
+  $("moment").oninput = () => {
     stop();
     const [from, to] = rows();
     move(from + Math.round((Number($("moment").value) / 1000) * (to - 1 - from)));
     remember();
-  });
+  };
   $("csv").onclick = () => { const [from, to] = rows(), names = ["t", view.x, view.y, ...view.shown]; saveTable("log.csv", Object.fromEntries(names.map((name) => [name, (name === "t" ? time : data[name]).slice(from, to)]))); };
   $("picture").onclick = () => savePicture("log.png", $("drawn"));
   form();

@@ -131,14 +131,11 @@ class Runs {
     });
   }
   entry(one) {
-    const mark = made("span", { className: "mark" }), pin = made("button", { type: "button", textContent: one.pinned ? "unpin" : "pin" });
-    mark.style.borderTopColor = one.colour;
-    pin.addEventListener("click", () => {
+    return made("li", {}, markOf(one.colour), one.name, " ", button(one.pinned ? "unpin" : "pin", () => {
       one.pinned = !one.pinned;
-      if (!one.pinned && one !== this.newest) this.all = this.all.filter((other) => other !== one);
+      this.all = this.all.filter((other) => other.pinned || other === this.newest);
       this.changed();
       this.draw();
-    });
-    return made("li", {}, mark, one.name, " ", pin);
+    }));
   }
 }

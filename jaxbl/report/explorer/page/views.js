@@ -293,8 +293,7 @@ class Page {
   }
   form() {
     const { view } = this, pick = (label, id, options, chosen, act = (value) => ({ [id]: value })) => choose(label, id.replaceAll(".", "-"), options, chosen, (value) => this.change(act(value)));
-    const filter = made("input", { id: "filter", value: view.filter, placeholder: "converged and margin > 1.1", autocomplete: "off" });
-    filter.addEventListener("change", () => this.change({ filter: filter.value }));
+    const filter = made("input", { id: "filter", value: view.filter, placeholder: "converged and margin > 1.1", autocomplete: "off", onchange: ({ target }) => this.change({ filter: target.value }) });
     $("choice").replaceChildren(pick("view", "kind", this.titles, view.kind), ...this.shown.form(pick), pick("scales", "log", [["log", "log where it fits"], ["linear", "linear"]], view.log), made("label", {}, "filter", filter));
   }
   async redraw() {
@@ -344,11 +343,9 @@ class Page {
     const values = Float64Array.from(rows, key), order = Uint32Array.from(rows.keys()).sort((a, b) => (values[a] - values[b]) || (values[a] === values[a] ? -1 : 1) - (values[b] === values[b] ? -1 : 1));
     const cell = ({ field, read }, row) => { const value = read(row); return field.names ? field.names[value] : field.yes ? (value ? "yes" : "no") : value; };
     $("count").textContent = `${rows.length === 1 ? "One point" : `${rows.length} points`} shown${rows.length < count && large ? " (of many)" : ""}, by ${study.fields.get(view.metric).label}`;
-    const draw = () => tableOf($("rows"), ["", ...names.map((one) => columns[one].field.label)], [...order.slice(0, MOST_ROWS)].map((k) => {
-      const button = made("button", { type: "button", textContent: "take" });
-      button.addEventListener("click", () => this.take(rows[k]));
-      return [button, ...names.map((name) => { const one = cell(columns[name], rows[k]); return typeof one === "number" ? text(one) : one; })];
-    }));
+    const words = (name, row) => { const one = cell(columns[name], row); return typeof one === "number" ? text(one) : one; };
+    const draw = () => tableOf($("rows"), ["", ...names.map((one) => columns[one].field.label)],
+      [...order.slice(0, MOST_ROWS)].map((k) => [button("take", () => this.take(rows[k])), ...names.map((name) => words(name, rows[k]))]));
     if ($("tabled").open) draw();
     $("tabled").ontoggle = draw;
     $("csv").onclick = () => saveTable("points.csv", Object.fromEntries(names.map((name) => [name, [...order].map((k) => cell(columns[name], rows[k]))])));
