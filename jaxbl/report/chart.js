@@ -54,7 +54,7 @@ const dotsOf = (chart, line) => (plot) => {
 };
 
 /**
- * `x` and `y` are { label, name, key, unit, names, log, ends }: the label stands along the axis, the name beside a value; names stand
+ * `x` and `y` are { label, name, key, unit, names, log, ends, hidden }: the label stands along the axis, the name beside a value; names stand
  * for the numbers 0, 1, ..., or as a Map for others; ends leave out what lies beyond, and may fall.
  * A line is { name, x, y, colour, alpha, dash, width, dots, shade, sorted, said }; `named` says the lines' names above.
  * Cells, behind the lines, are { x, y, size, colours, text }: ends along both axes, numbers of cells, the canvas of one pixel a
@@ -71,6 +71,8 @@ class Chart {
     this.box = made("div", { className: "values", hidden: true, ariaLive: "polite" });
     this.view = made("div", { className: "plane", tabIndex: 0 }, this.box);
     this.view.setAttribute("role", "application");
+    // uPlot sizes itself later
+    this.view.style.height = `${this.height}px`;
     this.key = made("div");
     element.replaceChildren(...(title ? [made("p", { className: "over", textContent: title })] : []), this.key, this.view, ...(caption ? [made("figcaption", { textContent: caption })] : []));
     this.listen();
@@ -101,7 +103,7 @@ class Chart {
   axis(name, i, ends) {
     const { label, unit, names, log } = this[name], colour = () => getComputedStyle(document.body).color, font = "12px system-ui, sans-serif";
     return {
-      scale: name, stroke: colour, font, labelFont: font, labelSize: 18, size: i ? 58 : this[name].turn ? 64 : 28, rotate: this[name].turn, gap: 3, side: i ? 3 : 2, space: i ? 32 : 70,
+      scale: name, show: !this[name].hidden, stroke: colour, font, labelFont: font, labelSize: 18, size: i ? 58 : this[name].turn ? 64 : 28, rotate: this[name].turn, gap: 3, side: i ? 3 : 2, space: i ? 32 : 70,
       label: label ? withUnit(label, unit) : undefined,
       grid: { show: !this.cells, stroke: `${GREY}40`, width: 1 }, ticks: { stroke: `${GREY}80`, width: 1, size: 4 },
       ...(names ? { splits: () => { const inside = [...names.keys()].filter((one) => one >= ends[0] && one <= ends[1]), every = Math.ceil((inside.length * (i ? 18 : 44)) / (i ? this.height : this.view.clientWidth)); return inside.filter((_, k) => k % every === 0); } } : {}),
@@ -115,7 +117,7 @@ class Chart {
     const colour = getComputedStyle(document.body).color, given = this.ends(), ends = (this.shown = given.map(([low, high]) => [Math.min(low, high), Math.max(low, high)])), lines = this.lines.length ? this.lines : [{ x: [], y: [] }];
     this.plot?.destroy();
     this.plot = new uPlot({
-      mode: 2, width, height: this.height, legend: { show: false }, padding: [8, 14, 0, 0], pxAlign: 0,
+      mode: 2, width, height: this.height, legend: { show: false }, padding: [8, 14, 0, this.y.hidden ? 14 : 0], pxAlign: 0,
       scales: Object.fromEntries(["x", "y"].map((name, i) => [name, { time: false, dir: given[i][0] > given[i][1] ? -1 : 1, distr: this[name].log ? 3 : 1, range: () => ends[i] }])),
       axes: ["x", "y"].map((name, i) => this.axis(name, i, ends[i])),
       cursor: { x: false, y: false, points: { show: false }, dataIdx: () => null, drag: { x: true, y: true, dist: 8, uni: 12, setScale: false }, bind: { dblclick: () => () => this.zoom(null) } },
@@ -171,8 +173,7 @@ class Chart {
     ctx.restore();
   }
   above(plot) {
-    const { ctx } = plot, unit = devicePixelRatio;
-    const { bbox } = plot;
+    const { ctx, bbox } = plot, unit = devicePixelRatio;
     ctx.save();
     for (const [x, y, kind] of this.marks) {
       const [left, top] = this.at(x, y, true);

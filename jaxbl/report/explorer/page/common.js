@@ -49,8 +49,6 @@ const head = ({ title, lead, config, file }) => {
   $("configname").textContent = file;
 };
 
-/* ------------------------------------------------------------------------------------------------------------- data */
-
 const waiting = new Map();
 /** Called by the scripts that carry a Parquet file for pages opened from disk. */
 globalThis.jaxblBytes = (number, content) => { waiting.get(number)(Uint8Array.from(atob(content), (one) => one.charCodeAt(0))); };
@@ -105,8 +103,6 @@ class Columns {
 /** What reads and draws, as a function that says it where that fails. */
 const reporting = (what, act) => () => act().catch((error) => { $("state").textContent = `${what} cannot be read: ${error.message}`; });
 
-/* ---------------------------------------------------------------------------------------------------------- colours */
-
 /** The colour of no value. */
 const MISSING = [189, 189, 189];
 const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => parseInt(one.slice(i, i + 2), 16)));
@@ -135,15 +131,11 @@ class Scale {
   get said() { return this.one || `from ${text(this.whole[0])} to ${text(this.whole[1])}`; }
   /** A bar with round values below it, and with what it shows above. */
   draw(element) {
-    const canvas = made("canvas"), density = devicePixelRatio, width = element.clientWidth, context = canvas.getContext("2d"), inner = width - 60;
-    element.replaceChildren(made("p", { className: "over", textContent: withUnit(this.label, this.unit) }), canvas);
-    Object.assign(canvas, { width: width * density, height: 30 * density });
-    canvas.style.cssText = `width: ${width}px; height: 30px`;
-    context.scale(density, density);
-    for (let k = 0; k < inner; k++) { context.fillStyle = `rgb(${this.colours[Math.round((255 * k) / inner)].join(",")})`; context.fillRect(30 + k, 0, 1.5, 12); }
-    Object.assign(context, { fillStyle: getComputedStyle(document.body).color, font: "12px system-ui, sans-serif", textAlign: "center", textBaseline: "top" });
-    const places = this.names ? this.names.map((name, k) => [name, k]) : this.one ? [[this.one, (this.low + this.high) / 2]] : ticks(this.low, this.high, this.log).map((one) => [text(one), one]);
-    for (const [name, value] of places) if (this.share(value) > -1e-6 && this.share(value) < 1 + 1e-6) context.fillText(name, 30 + inner * this.share(value), 15, 90);
+    const { low, high, log, one, label, unit } = this, names = one ? new Map([[(low + high) / 2, one]]) : this.names;
+    const bar = new Chart(element, { x: { ends: [low, high], log, names }, y: { ends: [0, 1], hidden: true }, height: 48, title: withUnit(label, unit) });
+    bar.cells = { x: [low, high], y: [0, 1], size: [256, 1], colours: sheetOf([256, 1], (k) => [...this.colours[k], 255]), text: () => null };
+    bar.set([]);
+    element.inert = true;
   }
 }
 
