@@ -1,6 +1,6 @@
 """Public rules for the gains of super-twisting, compared with the exact condition: `python benchmarks/tuning_rules.py`.
 
-It prints the table of docs/theory_appendix.md, and draws docs/figures/tuning_rules.png (`--figure FILE`).
+It prints the table of benchmarks/NOTES.md, and draws docs/figures/tuning_rules.png (`--figure FILE`).
 
 A rule for a region allows intervals of lambda for each alpha and f_plus. The worst case shrinks as lambda grows. A rule is
 therefore sufficient if and only if every lambda that it allows is above the exact bound, and every alpha above f_plus.
