@@ -17,7 +17,7 @@ from jaxbl.lines import NextStep
 from jaxbl.result import KeyFigure
 from jaxbl.terminal import STEPS, is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
-from .next_steps import LogCall, after_diagnosis, after_identification, after_proposal, after_watch
+from .next_steps import LogCall, after_diagnosis, after_identification, after_inspection, after_proposal, after_watch
 from .options import (
     FORMATS,
     ForceOption,
@@ -89,7 +89,8 @@ def inspect(
         remarks = [f"{write}: a first model.", *guesses, *card.remarks]
         card = replace(card, remarks=remarks, next_steps=after_proposal(log, write))
     with open_results(folder, log_subject(log), overwrite=overwrite) as results:
-        jaxbl.write_report(inspection, results, card)
+        # the terminal has no line left for it
+        jaxbl.write_report(inspection, results, replace(card, next_steps=card.next_steps or after_inspection(log, model)))
     return Outcome(card, folder, summary="inspection.json")
 
 

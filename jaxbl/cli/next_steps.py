@@ -52,6 +52,34 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
     return [*steps, _propose(question, "simulate", file, "--out", f"{folder}_run")]
 
 
+def after_run(card: "Result", config: Path) -> list[NextStep]:
+    """Propose the command that chooses gains, after one run with those of the study."""
+    question = "Which gains converge?" if card.verdict == "failed" else "Do other gains have less error, and what limits them?"
+    return [_propose(question, "tune", config)]
+
+
+def after_tuning(card: "Result", config: Path, folder: Path) -> list[NextStep]:
+    """Propose commands that take the gains which were found."""
+    if card.verdict == "failed":
+        return []
+    gains = "--gains", folder / "gains.toml", "--out"
+    run = _propose("How does the drive run with these gains?", "simulate", config, *gains, f"{folder}_run")
+    code = _propose("How do they come onto a controller? As C code.", "export", config, "--target", "c", *gains, f"{folder}_code")
+    return [run, code]
+
+
+def after_inspection(log: Path, model: Path | None) -> list[NextStep]:
+    """Propose the fit of a model to the log, or a first model where there is none."""
+    if model is not None:
+        return after_proposal(log, model)
+    return [_propose("What would a first model look like?", "inspect", log, "--write", f"{log.stem}.toml")]
+
+
+def after_comparison(folder: Path) -> list[NextStep]:
+    """Propose to look at the points of both studies."""
+    return [_propose("At which points do they differ, and how much? Maps in the browser.", "explore", folder)]
+
+
 def after_proposal(log: Path, model: Path) -> list[NextStep]:
     """Propose the command that takes a proposed model."""
     return [_propose("Which numbers does the machine have, and how sure are they?", "identify", log, "--model", model)]

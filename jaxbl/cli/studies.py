@@ -26,7 +26,7 @@ from jaxbl.terminal import (
     run_with_progress,
 )
 
-from .next_steps import after_sweep
+from .next_steps import after_comparison, after_run, after_sweep, after_tuning
 from .options import (
     BackendOption,
     ConfigArgument,
@@ -73,7 +73,8 @@ def simulate(
     with run_with_progress(context, config, folder, unit=STEPS, first="simulating"), lock_folder(folder):
         results = claim_study(folder, study, "simulate", overwrite=overwrite)
         trial = jaxbl.run(study, seed=seed, every=every)
-        card = jaxbl.write_report(trial, results)
+        card = jaxbl.describe(trial)
+        card = jaxbl.write_report(trial, results, replace(card, next_steps=after_run(card, config)))
     return Outcome(card, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
 
 
@@ -210,7 +211,7 @@ def tune(
 
     Read on: docs/tutorial.md
     """
-    return compute(context, config, read_study(context, config), jaxbl.tune, "tune")
+    return compute(context, config, read_study(context, config), jaxbl.tune, "tune", lambda card, _, folder: after_tuning(card, config, folder))
 
 
 @with_changes
@@ -228,7 +229,7 @@ def verify(
 
     Read on: docs/theory.md
     """
-    return compute(context, config, read_study(context, config), jaxbl.verify, "verify")
+    return compute(context, config, read_study(context, config), jaxbl.verify, "verify", lambda card, *_: after_run(card, config))
 
 
 def read_study(context: typer.Context, config: Path) -> "Config":
@@ -390,7 +391,9 @@ def compare(
         run_with_progress(context, folder, folder, unit=STEPS, first="comparing"),
         open_results(folder, Subject("comparison")) as results,
     ):
-        card = jaxbl.write_report(jaxbl.compare(*studies), results)
+        comparison = jaxbl.compare(*studies)
+        card = replace(jaxbl.describe(comparison), next_steps=after_comparison(folder))
+        card = jaxbl.write_report(comparison, results, card)
     return Outcome(card, folder, summary="comparison.json")
 
 

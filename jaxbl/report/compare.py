@@ -172,7 +172,7 @@ def draw_comparison(comparison: Comparison) -> list[Figure]:
     if not changes:
         return []
     config, frames = comparison.first_config, {change.metric: comparison.frame(change.metric) for change in changes}
-    figures = _factors(frames)
+    figures = _factors(frames, {change.metric: change.moved.value for change in changes})
     frame = next(iter(frames.values()))
     varied = [path for path in comparison.axes if frame[path].nunique() > 1]
     # of axes that advance together one is enough
@@ -219,10 +219,10 @@ def _spread(frame: pd.DataFrame, metric: str) -> float:
     return high / low
 
 
-def _factors(frames: dict[str, pd.DataFrame]) -> list[Figure]:
-    """Median and spread of the factor of each metric that has one."""
+def _factors(frames: dict[str, pd.DataFrame], means: dict[str, float]) -> list[Figure]:
+    """Mean and spread of the factor of each metric that has one."""
     rows = {
-        value_label(metric): change.quantile([0.05, 0.5, 0.95])
+        value_label(metric): (change.quantile(0.05), means[metric], change.quantile(0.95))
         for metric, frame in list(frames.items())[:_ROWS]
         if not is_boolean(metric) and (change := _change(frame, metric)).gt(0.0).any()
     }
@@ -231,7 +231,7 @@ def _factors(frames: dict[str, pd.DataFrame]) -> list[Figure]:
     places = list(range(len(rows)))
     parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(places, *zip(*rows.values(), strict=True), colour=BLUE)]
     y = Axis(ends=(len(rows) - 0.5, -0.5), names=tuple(enumerate(rows)))
-    caption = "Factor from the first study to the second: median of all points, and the range of nine in ten."
+    caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
     x = Axis("factor from the first study to the second", log=True)
     return [Figure("factors", [Panel(x, y, parts)], caption, height=0.9 + 0.3 * len(rows))]
 

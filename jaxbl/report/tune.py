@@ -319,7 +319,7 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     for side, verdict in summary["verdict"].items():
         worst, factors = summary["achieved"][side][metric], summary["holdout"]["factors"][side]
         factors_text = [
-            f"{factor[metric]['worst']:.3g} times as much with {describe_gains(name)}"
+            f"× {factor[metric]['worst']:.3g} with {describe_gains(name)}"
             for name, factor in factors.items()
             if "why_none" not in factor and factor[metric]["worst"] is not None
         ]

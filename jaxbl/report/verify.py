@@ -151,6 +151,12 @@ def describe_verdict(verdict: Verdict) -> Result:
         for gains in marks[:4]
         if gains["margin_exact"]
     ]
+    if not figures:
+        exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
+        figures = [
+            KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the exact condition holds")
+            for level, entry in exact[:4]
+        ]
     tables = [_level_table(level) for level in levels]
     tables += [table for level in levels for table in _claimed_tables(level)]
     if marks:

@@ -142,4 +142,6 @@ def draw_watch(watch: Watch) -> list[Figure]:
     caption = f"Numbers of the last {task.window:g} s by both observers, with 95 % intervals."
     if limit is not None:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
-    return [stack("watch", panels, caption, 1.5)]
+    # gap and stiffness are seen at once, friction below
+    parted = {"watch": panels[: len(law)], "watch_friction": panels[len(law) :]} if law else {"watch": panels}
+    return [stack(name, part, caption, 1.5) for name, part in parted.items()]
