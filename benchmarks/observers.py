@@ -1,4 +1,4 @@
-"""Kinds of observer in the situations of an engineer: the figure of docs/choosing_an_observer.md, tables of benchmarks/NOTES.md.
+"""Kinds of observer in the situations of an engineer: figure of docs/choosing_an_observer.md, tables of the notes.
 
     python benchmarks/observers.py [--out results/observers]    # about 12 minutes of processor time; goes on if stopped
 

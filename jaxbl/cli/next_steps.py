@@ -54,7 +54,8 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
 
 def after_run(card: "Result", config: Path) -> list[NextStep]:
     """Propose the command that chooses gains, after one run with those of the study."""
-    question = "Which gains converge?" if card.verdict == "failed" else "Do other gains have less error, and what limits them?"
+    better = "Do other gains have less error, and what limits them?"
+    question = "Which gains converge?" if card.verdict == "failed" else better
     return [_propose(question, "tune", config)]
 
 
@@ -62,10 +63,11 @@ def after_tuning(card: "Result", config: Path, folder: Path) -> list[NextStep]:
     """Propose commands that take the gains which were found."""
     if card.verdict == "failed":
         return []
-    gains = "--gains", folder / "gains.toml", "--out"
-    run = _propose("How does the drive run with these gains?", "simulate", config, *gains, f"{folder}_run")
-    code = _propose("How do they come onto a controller? As C code.", "export", config, "--target", "c", *gains, f"{folder}_code")
-    return [run, code]
+    gains = config, "--gains", folder / "gains.toml", "--out"
+    return [
+        _propose("How does the drive run with these gains?", "simulate", *gains, f"{folder}_run"),
+        _propose("How do they come onto a controller? As C code.", "export", *gains, f"{folder}_code"),
+    ]
 
 
 def after_inspection(log: Path, model: Path | None) -> list[NextStep]:

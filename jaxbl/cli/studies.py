@@ -211,7 +211,8 @@ def tune(
 
     Read on: docs/tutorial.md
     """
-    return compute(context, config, read_study(context, config), jaxbl.tune, "tune", lambda card, _, folder: after_tuning(card, config, folder))
+    study = read_study(context, config)
+    return compute(context, config, study, jaxbl.tune, "tune", lambda card, _, folder: after_tuning(card, config, folder))
 
 
 @with_changes
@@ -229,7 +230,8 @@ def verify(
 
     Read on: docs/theory.md
     """
-    return compute(context, config, read_study(context, config), jaxbl.verify, "verify", lambda card, *_: after_run(card, config))
+    study = read_study(context, config)
+    return compute(context, config, study, jaxbl.verify, "verify", lambda card, *_: after_run(card, config))
 
 
 def read_study(context: typer.Context, config: Path) -> "Config":

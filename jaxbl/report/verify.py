@@ -152,10 +152,10 @@ def describe_verdict(verdict: Verdict) -> Result:
         if gains["margin_exact"]
     ]
     if not figures:
-        exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
+        counted = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
         figures = [
-            KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the exact condition holds")
-            for level, entry in exact[:4]
+            KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the condition held")
+            for level, entry in counted[:4]
         ]
     tables = [_level_table(level) for level in levels]
     tables += [table for level in levels for table in _claimed_tables(level)]
