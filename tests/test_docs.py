@@ -32,11 +32,26 @@ def page_name(path):
     return str(path.relative_to(ROOT))
 
 
+def load_script(name):
+    """A program of docs as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_reference_is_generated_from_this_code():
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
-    generate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(generate)
+    generate = load_script("generate")
     assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), "run: python docs/generate.py"
+
+
+def test_pictures_are_what_is_drawn_today():
+    """Each picture was drawn anew since its studies, programs and the drawing of panels changed."""
+    inputs = load_script("picture_inputs")
+    table = inputs.read_table()
+    assert set(table) == {file.stem for file in inputs.FIGURES.glob("*.png")}
+    old = [name for name, entry in table.items() if inputs.hash_inputs(entry["inputs"]) != entry["hash"]]
+    assert old == [], "draw them anew by their command, look at them, and run: python docs/picture_inputs.py NAME ..."
 
 
 def test_tutorial_configs_are_valid():
