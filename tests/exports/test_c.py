@@ -140,6 +140,24 @@ def test_observer_and_controller_are_one_function(tmp_path, kind):
 
 
 @pytest.mark.program("gcc")
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_a_controller_in_float_is_as_good_many_turns_away(tmp_path, kind):
+    loop = {"controller": {"kind": kind, "side": "load"} | CONTROLLERS[kind],
+            "reference": {"kind": "moves", "distance": 0.3, "duration": 0.2},
+            "excitation": {"kind": "sine", "amplitude": 0.0, "frequency": 1.0}}  # fmt: skip
+    data = study("extended_state", **loop)
+    signals = jaxbl.simulate(jaxbl.experiment(data))
+    inputs = np.stack([signals.input, signals.motor.measured, signals.load.measured, *signals.target], axis=1)
+    # the load turns 10 000 times; the motor turns with it
+    turn = 2.0 * np.pi * 1e4 * np.array([0.0, data["drive"]["gear_ratio"], 1.0, 1.0, 0.0, 0.0])
+    native = export_native(tmp_path, data, "float")
+    native.dtype = np.dtype(float)
+    place = [output["name"] for output in native.summary["outputs"]].index("controller_torque")
+    near, away = (run_native(native, inputs + shift)[:, place] for shift in (0.0, turn))
+    np.testing.assert_allclose(away, near, atol=2e-3 * np.ptp(near))
+
+
+@pytest.mark.program("gcc")
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_nothing_is_identified_after_a_standstill(tmp_path, precision):
     data = study() | {"identifier": {"forgetting": 0.99}}
