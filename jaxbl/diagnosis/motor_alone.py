@@ -18,13 +18,11 @@ from jaxbl.chain import Experiment, with_effects
 from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters, units_of
-from jaxbl.errors import InputError
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
-from jaxbl.estimation.intervals import UNSEEN, Spread
 from jaxbl.estimation.logs import default_paths, on_record
-from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, why_not
+from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, search_gap
 from jaxbl.estimation.segments import segments_of, signal_sizes
-from jaxbl.estimation.unseen_load import SHOWN, GapSearch, Point, UnseenLoad, is_gap, widths
+from jaxbl.estimation.unseen_load import SHOWN, Point, UnseenLoad, is_gap, widths
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import percent
 from jaxbl.records import Record
@@ -138,29 +136,18 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
         InputError: a model that diverges.
     """
     search = _set_up(task)
-    model, gap, reason = search.model, None, ""
-    play = next((name for name, i in search.effects.items() if is_gap(model.free[i])), None)
-    if model.gap is not None:
-        # the model's own, or one that it lacks
-        gap = GapSearch(model).run()
-        point = gap.best if gap.is_needed or play is None else gap.without
-    else:
-        point = model.fit()
-    if not np.isfinite(point.deviance):
-        raise InputError(f"{task.record.path}: the model diverges on this log; its numbers should be nearer")
+    # the model's own, or one that it lacks
+    gap, point = search_gap(search.model, task.record)
     done()
     announce("comparing effects")
-    out = [play] if gap is not None and play is not None and not gap.is_needed else []
     history: list[Step] = []
+    plays = [] if gap is None else [name for name, i in search.effects.items() if i == search.model.gap]
+    # a gap of its own stays as free as it is
+    out, point = ([], gap.best) if gap is not None and (gap.is_needed or not plays) else (plays, point)
     point, gains = _drop_needless(search, point, out, history)
-    if gap is not None and gap.is_needed and play is not None:
-        gains[play] = gap.gain
-    point, width = _drop_open(search, point, out)
-    if gap is not None:
-        # what is said of it is said of the model that is left
-        gap = gap.of(point, width)
-        reason = why_not(gap, model, np.e, task.record)
-    alone = alone_of(model, point, width, [search.effects[name] for name in out], gap, reason)
+    gains |= {name: gap.gain for name in plays if gap is not None}
+    absent = [search.effects[name] for name in out]
+    alone = alone_of(search.model, *search.without(out).settle(point), absent, gap, np.e, task.record)
     done()
     announce("testing on held-out data")
     # names and numbers stand: only the verdict depends on what was held out
@@ -205,18 +192,6 @@ def _gain(search: _Search, name: str, without: Point, point: Point, inflation: n
     i = search.effects[name]
     prior = (without.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
     return float((without.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
-
-
-def _drop_open(search: _Search, point: Point, out: list[str]) -> tuple[Point, Spread]:
-    """The fit as of :meth:`UnseenLoad.settle`, without frictions whose size the log leaves open; these join `out`."""
-    while True:
-        point, width = search.without(out).settle(point)
-        deviation = {name: float(width.covariance[i, i]) ** 0.5 for name, i in search.effects.items()}
-        open_ = [name for name in search.frictions(out) if not deviation[name] < UNSEEN]
-        if not open_:
-            return point, width
-        out.append(max(open_, key=lambda name: deviation[name]))
-        point = search.finish(point, out)
 
 
 def _summary(

@@ -4,7 +4,7 @@
 # pyright: reportArgumentType=false
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,7 @@ from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
 from .log_columns import join_columns, motion_columns
 from .logs import arrays
+from .regression import balance
 from .search import SearchFit
 from .segments import Segment, at_period, segments_of
 from .trajectory import Fit, cut
@@ -74,21 +75,13 @@ def search_alone(
         InputError: the model diverges.
     """
     model = UnseenLoad(nominal, free, widths(free, settings.spread), segments, at_rest)
-    absent: list[int] = []
-    gap, reason = None, ""
-    if model.gap is None:
-        point, width = model.settle(model.fit())
+    gap, point = search_gap(model, record)
+    if gap is not None and gap.is_needed:
+        width = gap.spread
     else:
-        gap = GapSearch(model).run()
-        point, width = gap.best, gap.spread
-        reason = why_not(gap, model, settings.spread, record)
-        absent = [model.gap] if reason else []
-        if not gap.is_needed:
-            point, width = dataclasses.replace(model, held=absent).settle(gap.without)
-    if not np.isfinite(point.deviance):
-        raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
-    alone = alone_of(model, point, width, absent, gap, reason)
-    if not_met(model, point, record) or alone.doubtful:
+        point, width = dataclasses.replace(model, held=[] if model.gap is None else [model.gap]).settle(point)
+    alone = alone_of(model, point, width, [], gap, settings.spread, record)
+    if not_met(model, alone.point, record) or alone.doubtful:
         # numbers of a model that the log contradicts, with a gap of any size, or without a load have no interval
         nothing = np.full_like(alone.search_fit.spread.covariance, np.inf)
         search_fit = dataclasses.replace(alone.search_fit, spread=alone.search_fit.spread._replace(covariance=nothing))
@@ -96,12 +89,33 @@ def search_alone(
     return alone
 
 
-def alone_of(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int], gap: Gap | None, reason: str) -> Alone:
-    """A fit in which the numbers at some places (`absent`) are none that was found; `width`: its covariance."""
-    values = model.numbers(point.theta)
-    if gap is not None and not gap.is_needed and model.gap is not None:
-        values[model.free[model.gap].path] = 0.0
-    return Alone(_describe_fit(model, point, width, absent), values, gap, reason, model, point)
+def search_gap(model: UnseenLoad, record: Record) -> tuple[Gap | None, Point]:
+    """Search for a gap, where the model has one to be found; and the fit to go on from, without one that is not needed.
+
+    Raises:
+        InputError: the model diverges.
+    """
+    gap = None if model.gap is None else GapSearch(model).run()
+    point = model.fit() if gap is None else gap.best if gap.is_needed else gap.without
+    if not np.isfinite(point.deviance):
+        raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
+    return gap, point
+
+
+def alone_of(
+    model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int], gap: Gap | None, spread: float, record: Record
+) -> Alone:
+    """The fit that a search ended with, and its covariance (`width`); the numbers at some places (`absent`) are none that
+    was found. `spread`: factor by which inertias and stiffness may be off."""
+    values, reason = model.numbers(point.theta), ""
+    if gap is not None and model.gap is not None:
+        # what is said of the gap is said of the model that is left
+        gap = gap.of(point, width)
+        reason = why_not(gap, model, spread, record)
+        absent = [*absent, model.gap] if reason else absent
+        if not gap.is_needed:
+            values[model.free[model.gap].path] = 0.0
+    return Alone(_describe_fit(model, point, width, {*absent}), values, gap, reason, model, point)
 
 
 _FACTOR, _LEFT = 6.0, 0.05
@@ -159,24 +173,18 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     return ""
 
 
-def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Sequence[int]) -> SearchFit:
+def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collection[int]) -> SearchFit:
     """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
-    sought = np.setdiff1d(np.arange(len(model.free)), absent)
+    sought = np.setdiff1d(np.arange(len(model.free)), [*absent])
     width_sought = _only(width, sought)
     refused, condition = refusals([model.free[i] for i in sought], width_sought)
     visible = sought[np.sqrt(np.diag(width_sought.covariance)) < UNSEEN]
-    torque, readings = (
-        np.concatenate(pieces)
-        for pieces in zip(*((segment.torque, segment.readings["motor"]) for segment in model.segments), strict=True)
-    )
+    torque = np.concatenate([segment.torque for segment in model.segments])
     # all of the log as one window, without a state of its own
-    windows = cut(
-        torque, {"motor": readings}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque),
-        at_rest=model.at_rest,
-    )  # fmt: skip
+    windows = cut(torque, {}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque))
     residual = (point.errors / model.noise)[None, :, None]
-    cost = 0.5 * np.sum(residual**2)
-    fit = Fit(jnp.asarray(point.theta[visible]), windows.start, residual, np.zeros((*residual.shape, 0)), cost, np.True_)
+    none = np.zeros((*residual.shape, 0))
+    fit = Fit(jnp.asarray(point.theta[visible]), windows.start, residual, none, 0.5 * np.sum(residual**2), np.True_)
     return SearchFit(
         free=tuple(model.free[i] for i in visible), fit=fit,
         spread=_only(width, visible)._replace(variance=point.variance / model.noise**2),
@@ -199,14 +207,15 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     """
     assert record.torque is not None
     fitted, model, pieces = alone.experiment, alone.model, []
-    plant = fitted.plant
     for segment, state in zip(model.segments, model.states(alone.point), strict=True):
         k, state = segment.kinematics, jax.tree.map(jnp.asarray, state)
-        through = jax.vmap(plant.transmitted_torque)(state.position, state.velocity, state.effects)[0]
-        motion = state.position | k.position, state.velocity | k.velocity, state.effects
-        total, level = jax.vmap(plant.side_torques)(*motion, k.torque, k.time, jnp.zeros_like(through))["motor"]
-        speed = k.velocity["motor"]
-        resisting = fitted.drive.viscous("motor") * speed + level * jnp.sign(speed)
+        through = jax.vmap(fitted.plant.transmitted_torque)(state.position, state.velocity, state.effects)[0]
+        # without a torque in the gear the motor's equation leaves over what it should be
+        none = jnp.zeros_like(through)
+        motion = dataclasses.replace(
+            k, position=state.position | k.position, velocity=state.velocity | k.velocity,
+            acceleration={"load": none} | k.acceleration, transmitted=none,
+        )  # fmt: skip
         pieces.append(
             motion_columns(segment, "motor")
             | {
@@ -214,7 +223,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
                 "load.modelled_position": state.position["load"],
                 "load.modelled_velocity": state.velocity["load"],
                 "torque": through,
-                "torque_by_motor": total - resisting - plant.inertia("motor") * k.acceleration["motor"],
+                "torque_by_motor": balance(fitted, motion)["motor"].residual,
             }
         )
     columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}

@@ -6,8 +6,8 @@ readings correct the motor's side alone; the load moves by what the model transm
 least where the numbers are right.
 
 Over the half gap the likelihood has several maxima. So the fit begins at half gaps from what the encoder resolves to what
-the motor travels, with a predictor that follows the readings closely and so remembers little; from the best of them on the
-predictor is the one with the least errors.
+the motor travels: frictions first, inertias and stiffness as given, with a predictor that follows the readings closely and
+so remembers little; then all numbers, with one that remembers more; from the best on with the one of the least errors.
 References: L. Ljung, System Identification (1999), 7.2; M. Nordin, P.-O. Gutman, Controlling mechanical systems with
 backlash: a survey, Automatica 38 (2002), 4 (what a motor's side shows of a gap).
 """
@@ -18,20 +18,18 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtri
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import AbstractEffect
-from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.workers import announce
 
-from .free_parameters import PRIOR_DEVIATION, FreeParameter
+from .free_parameters import PRIOR_DEVIATION, FreeParameter, free_values
 from .intervals import LIMIT, Spread, long_run, step_at_limit, without_gain
 from .prediction import kalman_gain
 from .regression import begin_states
@@ -56,12 +54,6 @@ _BACK = 4
 """Back from a fit beside it."""
 _CHOICES = 4
 """Of the predictor that suits the fit, at most."""
-_WORTH = 20.0
-"""Independent errors that a log counts for while the model is still wrong."""
-_FINALISTS = 4
-"""Half gaps of which the fit goes on."""
-_HOPELESS = 9.0
-"""Mean square over the least from which on a fit is given up."""
 _PART = 4000
 """Samples that the first fits are made to."""
 _SETTLED = 0.01
@@ -77,6 +69,8 @@ _APART = 0.2
 """Prior standard deviation of the load's first speed about the motor's, over the motor's rms speed."""
 _STATES = 4
 """Numbers that a part of a log begins with: positions and velocities of both sides."""
+_IN_CONTACT = np.array([0.0, 0.0, 1.0, 0.0])
+"""Size of these by the prior: at a flank of the gap, the load as fast as the motor."""
 _ignore_divergence = partial(np.errstate, invalid="ignore", over="ignore")
 """A model that diverges is given up by its errors."""
 GAPS = "half_gap", "dead_zone"
@@ -108,6 +102,11 @@ class Point(NamedTuple):
         with _ignore_divergence():
             return float(np.nan_to_num(np.mean(self.errors**2), nan=np.inf))
 
+    @property
+    def away(self) -> np.ndarray:
+        """Theta, and starts off the mean of their prior: in contact on the flank that each is at; shape (numbers,)."""
+        return np.concatenate([self.theta, (self.start - np.sign(self.start) * _IN_CONTACT).ravel()])
+
 
 @dataclass(eq=False)
 class UnseenLoad:
@@ -134,11 +133,16 @@ class UnseenLoad:
         self.free = tuple(parameter._replace(positive=True) if is_gap(parameter) else parameter for parameter in self.free)
         self.period = float(self.experiment.run.sample_period)
         self.skipped = [int(_SKIPPED * len(segment)) for segment in self.segments]
-        self.count = sum(map(len, self.segments)) - sum(self.skipped)
-        motions = [segment.smoothed["motor"] for segment in self.segments]
-        self._first = np.array([motion.state[0, :2] for motion in motions])
-        self._open = np.array([[motion.deviation(i)[0] for i in (0, 1)] for motion in motions])
-        self._speed = rms(np.concatenate([motion.velocity for motion in motions]))
+        # segment of each error
+        self.owner = np.concatenate(
+            [
+                np.full(len(segment) - skip, i)
+                for i, (segment, skip) in enumerate(zip(self.segments, self.skipped, strict=True))
+            ]
+        )
+        self.count = len(self.owner)
+        self.precision = np.concatenate([self.width**-2.0, np.ones(_STATES * len(self.segments))])
+        self._speed = rms(np.concatenate([segment.smoothed["motor"].velocity for segment in self.segments]))
         self.torque = rms(np.concatenate([segment.torque for segment in self.segments]))
         self.noise = reading_noise(self.segments)["motor"]
 
@@ -207,43 +211,51 @@ class UnseenLoad:
     def numbers(self, theta: np.ndarray) -> dict[str, float]:
         """Values by path."""
         with np.errstate(over="ignore"):
-            return {number.path: float(number.value(float(x))) for number, x in zip(self.free, theta, strict=True)}
+            return free_values(self.free, theta)
+
+    def number(self, path: str, theta: np.ndarray) -> float:
+        """Value of a number of the model, free or not."""
+        table, _, name = path.partition(".")
+        return self.numbers(theta).get(path, float(getattr(getattr(self.experiment, table), name)))
 
     def half_gap(self, theta: np.ndarray) -> float:
         """Half gap, rad."""
         if self.gap is None:
-            return self._constants["half"]
+            return float(self.experiment.plant.half_gap)
         number = self.free[self.gap]
         return half_gap_of(number) * self.numbers(theta)[number.path]
 
     def states(self, point: Point) -> list[PlantState]:
         """The predictor's states before it has seen each sample's reading, by segment, leaves of shape (samples,)."""
-        return [jax.tree.map(lambda x: x[0], self._runs(point, i, start[None])) for i, start in enumerate(point.start)]
+        numbers, gain = self.numbers(point.theta), {"motor": kalman_gain(float(point.smoothness), self.period)}
+        ratio = self.number("drive.gear_ratio", point.theta)
+        largest = self.half_gap(point.theta) + self.torque / self.number("transmission.stiffness", point.theta)
+        states_of = []
+        for segment, effects, offset in zip(self.segments, self._first_states, point.start, strict=True):
+            motion, still = segment.smoothed["motor"], 0.0 if self.at_rest else 1.0
+            position, velocity = (motion.state[0, i] + motion.deviation(i)[0] * offset[i] for i in (0, 1))
+            load = velocity + _APART * self._speed * offset[3]
+            state = PlantState(
+                {"motor": position, "load": (position - largest * offset[2]) / ratio},
+                {"motor": still * velocity, "load": still * load / ratio},
+                effects,
+            )
+            arguments = state, segment.torque, segment.time[0], {"motor": segment.readings["motor"]}
+            start, torque, time, readings = jax.tree.map(lambda x: np.asarray(x)[None], arguments)
+            states = self._model(numbers, start, torque, time, readings, gain)
+            states_of.append(jax.tree.map(lambda x: x[0], states))
+        return states_of
 
     def evaluate(self, point: Point) -> Point:
         """A point with its prediction errors by this model."""
-        errors = [self._errors(point, i, start[None])[0] for i, start in enumerate(point.start)]
-        return self._with_errors(point, errors)
-
-    def _errors(self, point: Point, place: int, starts: np.ndarray) -> np.ndarray:
-        """Subtract predictions from several starts from the readings of a segment; shape (runs, counted samples)."""
-        states = self._runs(point, place, starts)
-        with _ignore_divergence():
-            errors = self.segments[place].readings["motor"] - np.asarray(states.position["motor"])
-        return errors[:, self.skipped[place] :]
-
-    def _with_errors(self, point: Point, segment_errors: Sequence[np.ndarray]) -> Point:
-        errors = np.concatenate(segment_errors)
-        prior = np.sum((point.theta / self.width) ** 2) + np.sum((point.start - self._expect_start(point.start)) ** 2)
+        pieces = zip(self.segments, self.states(point), self.skipped, strict=True)
         # a model that diverges
         with _ignore_divergence():
-            deviance = self.count * np.log(np.mean(errors**2)) + prior
-        return point._replace(errors=errors, deviance=float(deviance) if np.isfinite(deviance) else np.inf)
-
-    @staticmethod
-    def _expect_start(start: np.ndarray) -> np.ndarray:
-        """Mean of the prior of a start: in contact on the flank that it is at."""
-        return np.stack([np.sign(column) if i == 2 else np.zeros(len(column)) for i, column in enumerate(start.T)], axis=1)
+            errors = np.concatenate(
+                [(segment.readings["motor"] - state.position["motor"])[skip:] for segment, state, skip in pieces]
+            )
+            deviance = float(self.count * np.log(np.mean(errors**2)) + np.sum(self.precision * point.away**2))
+        return point._replace(errors=errors, deviance=deviance if np.isfinite(deviance) else np.inf)
 
     @cached_property
     def _first_states(self) -> list[EffectStates]:
@@ -259,49 +271,15 @@ class UnseenLoad:
             self.experiment, PlantState(zero, zero, self._first_states[0]), [number.path for number in self.free], ["motor"]
         )
 
-    @cached_property
-    def _constants(self) -> dict[str, float]:
-        """Half gap, stiffness and gear ratio without the free numbers."""
-        plant = self.experiment.plant
-        assert plant.transmission is not None
-        return {
-            "transmission.stiffness": float(plant.transmission.stiffness),
-            "drive.gear_ratio": float(plant.drive.ratio("load")),
-            "half": plant.half_gap,
-        }
-
-    def _runs(self, point: Point, place: int, starts: np.ndarray) -> PlantState:
-        """Simulate a segment from several starts, shape (runs, 4)."""
-        segment, numbers = self.segments[place], self.numbers(point.theta)
-        constants = self._constants | numbers
-        ratio = constants["drive.gear_ratio"]
-        position, velocity = (self._first[place] + self._open[place] * starts[:, :2]).T
-        twist = starts[:, 2] * (self.half_gap(point.theta) + self.torque / constants["transmission.stiffness"])
-        load = velocity + _APART * self._speed * starts[:, 3]
-        if self.at_rest:
-            velocity, load = np.zeros_like(velocity), np.zeros_like(load)
-        effects = jax.tree.map(lambda x: np.full(len(starts), x), self._first_states[place])
-        state = PlantState(
-            {"motor": position, "load": (position - twist) / ratio}, {"motor": velocity, "load": load / ratio}, effects
-        )
-        shape = len(starts), len(segment)
-        torque, readings = (np.broadcast_to(x, shape) for x in (segment.torque, segment.readings["motor"]))
-        time = np.full(len(starts), float(segment.time[0]))
-        gain = kalman_gain(float(point.smoothness), self.period)
-        return self._model(numbers, state, torque, time, {"motor": readings}, {"motor": gain})
-
     def begin(self, theta: np.ndarray, smoothness: float) -> Point:
         """With each segment beginning where in the gap, and with which speed of the load, suits it best."""
-        tries = np.array([[0.0, 0.0, twist, speed] for twist in (1.0, -1.0, 1e-3) for speed in (0.0, 2.0, -2.0)])
-        point, errors = Point(theta, np.zeros((len(self.segments), _STATES)), smoothness), []
-        for i in range(len(self.segments)):
-            runs = self._errors(point, i, tries)
-            with _ignore_divergence():
-                squares = np.sum(runs**2, axis=1)
-            best = int(np.argmin(np.where(np.isfinite(squares), squares, np.inf)))
-            point.start[i] = tries[best]
-            errors.append(runs[best])
-        return self._with_errors(point, errors)
+        none = Point(theta, np.zeros((len(self.segments), _STATES)), smoothness)
+        tries = [(0.0, 0.0, twist, speed) for twist in (1.0, -1.0, 1e-3) for speed in (0.0, 2.0, -2.0)]
+        squares = [
+            np.bincount(self.owner, self.evaluate(none._replace(start=none.start + start)).errors ** 2) for start in tries
+        ]
+        best = np.argmin(np.where(np.isfinite(squares), squares, np.inf), axis=0)
+        return self.evaluate(none._replace(start=np.array(tries)[best]))
 
     def predict(self, theta: np.ndarray, smoothness: float) -> Point:
         """Prediction errors of given numbers; initial states alone are fitted, first with predictors that follow closely."""
@@ -316,47 +294,37 @@ class UnseenLoad:
 
         `size`: standard errors, all else known; shape (free + 4 segments,).
         """
-        count, states = len(self.free), point.start.size
-        step = np.full(count + states, 1e-2 * _STEP) if size is None else np.clip(_SHARE * size, _SHORTEST, _STEP)
-        columns = np.zeros((self.count, count + states))
-        for i in {*range(count)} - {*self.held}:
-            theta = point.theta.copy()
-            theta[i] += step[i]
-            columns[:, i] = (self.evaluate(point._replace(theta=theta)).errors - point.errors) / step[i]
-        row, column = 0, count
-        for i, start in enumerate(point.start):
-            steps = step[column : column + _STATES]
-            runs = self._errors(point, i, start + np.diag(steps))
-            rows = slice(row, row + runs.shape[1])
-            columns[rows, column : column + _STATES] = ((runs - point.errors[rows]) / steps[:, None]).T
-            row, column = rows.stop, column + _STATES
+        count, rows = len(self.free), np.arange(self.count)
+        step = np.full(count + point.start.size, 1e-2 * _STEP) if size is None else np.clip(_SHARE * size, _SHORTEST, _STEP)
+        columns = np.zeros((self.count, len(step)))
+        # a start acts in its own segment: those of all segments at once
+        for i in {*range(count + _STATES)} - {*self.held}:
+            column = np.full(self.count, i) if i < count else i + _STATES * self.owner
+            change = np.zeros(len(step))
+            change[column] = step[column]
+            columns[rows, column] = (self.evaluate(self._move(point, change)).errors - point.errors) / step[column]
         return np.where(np.isfinite(columns), columns, 0.0)
 
-    def _precision(self) -> np.ndarray:
-        """Precision of the priors of theta and of the starts, shape (free + 4 segments,)."""
-        return np.concatenate([self.width**-2.0, np.ones(_STATES * len(self.segments))])
+    def _move(self, point: Point, change: np.ndarray) -> Point:
+        """A point whose theta and starts are changed."""
+        theta, start = np.split(change, [len(self.free)])
+        return point._replace(theta=point.theta + theta, start=point.start + start.reshape(point.start.shape))
 
     def solve(self, point: Point, steps: int) -> Point:
         """Levenberg-Marquardt from a point, with its predictor."""
-        precision, count = self._precision(), len(self.free)
         best, damping, size = point, 1e-3, None
         for _ in range(steps):
             if not np.isfinite(best.deviance):
                 break
             slope = self.slopes(best, size)
-            away = np.concatenate([best.theta, (best.start - self._expect_start(best.start)).ravel()])
-            matrix = slope.T @ slope / best.variance + np.diag(precision)
+            matrix = slope.T @ slope / best.variance + np.diag(self.precision)
             size = np.diag(matrix) ** -0.5
-            towards = slope.T @ best.errors / best.variance + precision * away
+            towards = slope.T @ best.errors / best.variance + self.precision * best.away
             towards[self.held] = 0.0
-            matrix[self.held], matrix[:, self.held] = 0.0, 0.0
-            matrix[self.held, self.held] = 1.0
             gained = 0.0
             for _ in range(_MOST_REJECTED):
-                change = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), towards)
-                change = np.clip(change, -1.0, 1.0)
-                theta, start = best.theta + change[:count], best.start + change[count:].reshape(-1, _STATES)
-                following = self.evaluate(best._replace(theta=theta, start=start))
+                change = -np.linalg.solve(matrix + damping * np.diag(size**-2.0), towards)
+                following = self.evaluate(self._move(best, np.clip(change, -1.0, 1.0)))
                 gained = best.deviance - following.deviance
                 if gained > 0.0:
                     best, damping = following, max(0.1 * damping, 1e-9)
@@ -380,19 +348,17 @@ class UnseenLoad:
                 break
         return point
 
-    def follow(self, point: Point) -> Point:
-        """Go from a predictor that follows the readings closely to the one that suits the model."""
-        return self.finish(self.resume(point, _MORE, _FOLLOWING[-1]))
-
-    def fit(self) -> Point:
-        """Fit without a gap to be found, from the nominal numbers."""
+    def fit(self, thetas: Sequence[np.ndarray] = ()) -> Point:
+        """The best fit from some numbers, by default :meth:`beginnings`: from a predictor that follows the readings closely
+        to the one that suits the model."""
         coarse = self.coarse()
-        ends = [coarse.follow(coarse.begin(theta, _FOLLOWING[0])) for theta in self.beginnings()]
+        begun = [coarse.begin(theta, _FOLLOWING[-1]) for theta in thetas or self.beginnings()]
+        ends = [coarse.finish(coarse.solve(point, _MORE)) for point in begun]
         return self.finish(_likeliest(ends))
 
     def measure_unexplained(self, point: Point) -> float:
         """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
-        inertia = self.numbers(point.theta).get("drive.motor_inertia", float(self.experiment.plant.inertia("motor")))
+        inertia = self.number("drive.motor_inertia", point.theta)
         return inertia * float(np.sqrt(point.smoothness)) * self.noise / self.period**2
 
     def settle(self, point: Point) -> tuple[Point, Spread]:
@@ -413,10 +379,8 @@ class UnseenLoad:
 
     def _noisier(self, point: Point) -> list[Point]:
         """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
-        if self.torque_noise < _QUIET * self.torque:
-            return []
         points = []
-        for seed in range(_DRAWS):
+        for seed in range(_DRAWS if self.torque_noise > _QUIET * self.torque else 0):
             draw = np.random.default_rng(seed).standard_normal
             segments = [
                 replace(segment, torque=segment.torque + self.torque_noise * draw(len(segment))) for segment in self.segments
@@ -426,22 +390,20 @@ class UnseenLoad:
 
     def spread(self, point: Point) -> Spread:
         """Covariance of theta, of data and priors together."""
-        count, precision = len(self.free), self._precision()
+        count, precision, size = len(self.free), self.precision.copy(), None
         precision[self.held] = 1e12
-        size = None
         for _ in range(2):
             slope = self.slopes(point, size) / np.sqrt(point.variance)
             size = (np.sum(slope**2, axis=0) + precision) ** -0.5
         assert size is not None
-        scores = slope * size * (point.errors / np.sqrt(point.variance))[:, None]
-        prior = np.diag(precision * size**2)
-        middle = long_run(scores) + prior
-        white = inverse((slope * size).T @ (slope * size) + prior)
+        unit, prior = slope * size, np.diag(precision * size**2)
+        middle = long_run(unit * (point.errors / np.sqrt(point.variance))[:, None]) + prior
+        white = inverse(unit.T @ unit + prior)[:count]
         scale = np.outer(size, size)[:count, :count]
-        inner = white[:count, :count] * scale
+        inner = white[:, :count] * scale
         # by a root of the middle: never negative, whatever rounding does
         size_of, ways = np.linalg.eigh(middle)
-        half = (white @ (ways * np.sqrt(np.maximum(size_of, 0.0))))[:count]
+        half = white @ (ways * np.sqrt(np.maximum(size_of, 0.0)))
         covariance, inflation = without_gain(half @ half.T * scale, inner)
         return Spread(covariance, inverse(inner), point.variance, inflation)
 
@@ -526,10 +488,6 @@ def widths(free: Sequence[FreeParameter], factor: float) -> np.ndarray:
 
 _ANY = 100.0
 """Prior standard deviation of a gap's theta: none."""
-_NEAR = 0.3
-"""Prior standard deviation of what is known while the model is still wrong."""
-_TOUCH = 0.01
-"""Torque in the gear over the input's, rms, below which the load was not met: a softened gap has no sharp flanks."""
 _NONE = 1e-9
 """Half gap over the motor's travel that stands for none."""
 
@@ -543,16 +501,13 @@ class GapSearch:
 
     def __init__(self, model: UnseenLoad):
         self.model, self.coarse = model, model.coarse()
-        width = np.where([is_known(number) for number in model.free], np.minimum(_NEAR, model.width), model.width)
-        width = np.where([is_gap(number) for number in model.free], _ANY, width * np.sqrt(_WORTH / model.count))
-        self.near = replace(self.coarse, width=width)
         assert model.gap is not None
         self.place: int = model.gap
         # the same with the gap as it is
-        self.model_held, self.coarse_held, self.near_held = (
-            replace(fits, held=[self.place]) for fits in (model, self.coarse, self.near)
-        )
-        self.part = replace(self.near_held, segments=[max(model.segments, key=len)[:_PART]])
+        self.model_held, self.coarse_held = (replace(fits, held=[self.place]) for fits in (model, self.coarse))
+        known = [i for i, number in enumerate(model.free) if is_known(number)]
+        part = [max(model.segments, key=len)[:_PART]]
+        self.part = replace(self.coarse, held=[*known, self.place], segments=part)
         self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
 
     def _with_gap(self, half: float, theta: np.ndarray) -> np.ndarray:
@@ -565,19 +520,26 @@ class GapSearch:
         announce("trying half gaps")
         starts = self._starts()
         announce("fitting the gap")
-        best, spread = self.model.settle(self._best(starts))
+        fits = [self.coarse.solve(self.coarse.begin(point.theta, _FOLLOWING[-1]), _MORE) for _, point in starts]
+        best, spread = self.model.settle(self.model.fit([_likeliest(fits).theta]))
         announce("fitting without a gap")
-        without = self._without(best)
-        worth = float(spread.inflation[self.place]) ** 2
-        gain = max(without.deviance - best.deviance, 0.0) / max(worth, 1.0)
+        none = _NONE * self.travel
+        without = self.model_held.fit([self._begin(none).theta, self._with_gap(none, best.theta)])
+        # what neighbouring fits find differently makes numbers uncertain, and rules out less; it is no correlation of errors
+        correlated, worth = (
+            max(float(width.inflation[self.place]) ** 2, 1.0) for width in (self.model.spread(best), spread)
+        )
+        gain = max(without.deviance - best.deviance, 0.0) / correlated
         least = min(point.variance for _, point in starts)
         deviances = [(half, self.model.count * float(np.log(point.variance / least))) for half, point in starts]
         gap = Gap(best, without, spread, gain, 0, self.travel, deviances, self.travel)
         if gap.is_needed:
-            return gap._replace(crossings=self._turns(best, self.model.experiment, self.model.half_gap(best.theta)))
+            return gap._replace(crossings=self._turns(best, self.model.half_gap(best.theta)))
         if self._unmet(without, starts[-1][1], worth):
             return gap._replace(unmet=True)
-        return gap._replace(at_most=self._at_most(without, worth), crossings=self._reversals(without))
+        # of the torque in the gear, by a twentieth of the input's rms on either side
+        wound = 0.05 * self.model.torque / self.model.number("transmission.stiffness", without.theta)
+        return gap._replace(at_most=self._at_most(without, worth), crossings=self._turns(without, wound))
 
     def _starts(self) -> list[tuple[float, Point]]:
         """Short fits at half gaps from the encoder's noise to more than the motor's travel, where the load is never met."""
@@ -586,47 +548,19 @@ class GapSearch:
         return [(float(half), self._begin(half)) for half in grid]
 
     def _begin(self, half: float) -> Point:
-        """A short fit at a half gap, the other numbers held near to what is known of them."""
+        """A short fit of frictions at a half gap, inertias and stiffness as given."""
         starts = [self.part.begin(self._with_gap(half, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
         return min((self.part.solve(start, _FEW) for start in starts), key=lambda point: point.variance)
-
-    def _best(self, starts: Sequence[tuple[float, Point]]) -> Point:
-        """The best fit from the half gaps that are better than their neighbours."""
-        size = np.array([np.inf, *(point.variance for _, point in starts), np.inf])
-        valleys = [i - 1 for i in range(1, len(size) - 1) if size[i] <= min(size[i - 1], size[i + 1])]
-        chosen = sorted(valleys, key=lambda i: size[i + 1])[:_FINALISTS]
-        thetas = [starts[i][1].theta for i in chosen]
-        for smoothness, count in zip(_FOLLOWING, (_FINALISTS, 2), strict=True):
-            points = [self.near.solve(self.near.begin(theta, smoothness), _MORE) for theta in thetas]
-            points.sort(key=lambda point: point.variance)
-            thetas = [point.theta for point in points[:count] if point.variance < _HOPELESS * points[0].variance]
-        ends = [self.coarse.follow(self.coarse.begin(theta, _FOLLOWING[-1])) for theta in thetas]
-        return self.model.finish(_likeliest(ends))
-
-    def _without(self, best: Point) -> Point:
-        """The best model without a gap, begun at the nominal numbers and at those of the best one with."""
-        none = _NONE * self.travel
-        points = []
-        for theta in (self._begin(none).theta, self._with_gap(none, best.theta)):
-            point = self.near_held.solve(self.near.begin(theta, _FOLLOWING[0]), _FEW)
-            points.append(self.coarse_held.resume(point, _MORE, _FOLLOWING[1]))
-        return self.model_held.finish(self.coarse_held.follow(_likeliest(points)))
 
     def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
         """Tell if the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
         # the load in the middle of the gap
         middle = begun._replace(start=np.zeros_like(without.start))
-        point = self.near_held.resume(middle, _FEW, _FOLLOWING[0])
-        point = self.model_held.finish(self.coarse_held.follow(point))
-        if not (point.deviance - without.deviance) / worth <= LIMIT:
-            return False
-        plant = set_leaves(self.model.experiment, self.model.numbers(point.theta)).plant
+        point = self.model_held.finish(self.coarse_held.resume(middle, _MORE, _FOLLOWING[-1]))
         # on one flank, where a weight may hold the load, the load is met
-        met = []
-        for state, skip in zip(self.model.states(point), self.model.skipped, strict=True):
-            motion = jax.tree.map(jnp.asarray, (state.position, state.velocity, state.effects))
-            met.append(np.asarray(jax.vmap(plant.transmitted_torque)(*motion)[0])[skip:])
-        return rms(np.concatenate(met)) < _TOUCH * self.model.torque
+        half = self.model.half_gap(point.theta)
+        met = any(np.any(np.abs(twist) >= half) for twist in self._twists(point))
+        return not met and (point.deviance - without.deviance) / worth < SHOWN
 
     def _at_most(self, without: Point, worth: float) -> float:
         """The largest half gap that fits about as well as none; the motor's travel where all do."""
@@ -641,14 +575,12 @@ class GapSearch:
             half *= 1.6
         return self.travel
 
-    def _reversals(self, point: Point) -> int:
-        """Count how often the transmitted torque changes its sign, by a twentieth of the input's rms on either side."""
-        experiment = set_leaves(self.model.experiment, self.model.numbers(point.theta))
-        assert experiment.transmission is not None
-        return self._turns(point, experiment, 0.05 * self.model.torque / float(experiment.transmission.stiffness))
+    def _twists(self, point: Point) -> list[np.ndarray]:
+        """Twist by segment, rad."""
+        ratio = self.model.number("drive.gear_ratio", point.theta)
+        return [np.asarray(state.position["motor"] - ratio * state.position["load"]) for state in self.model.states(point)]
 
-    def _turns(self, point: Point, experiment: Experiment, size: float) -> int:
+    def _turns(self, point: Point, size: float) -> int:
         """Count changes of sign of the twist between values of at least some size, rad: of flanks, if it is the half gap."""
-        ratio = float(experiment.drive.ratio("load"))
-        twists = [np.asarray(state.position["motor"] - ratio * state.position["load"]) for state in self.model.states(point)]
+        twists = self._twists(point)
         return sum(int(np.count_nonzero(np.diff(np.sign(twist[np.abs(twist) >= size])))) for twist in twists)

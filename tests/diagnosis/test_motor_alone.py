@@ -10,11 +10,11 @@ from hidden.simulator import Machine, Run, simulate
 from hidden_log import FRICTIONS, GAP, GEARED, select_samples, simulate_geared_drive
 
 from jaxbl.config import read_model
-from jaxbl.diagnosis import motor_alone
 from jaxbl.diagnosis.diagnose import diagnose, read_diagnosis_task, run_diagnosis
 from jaxbl.diagnosis.motor_alone import list_sought
 from jaxbl.diagnosis.next_experiment import with_gap
 from jaxbl.drive.effects import DELAY_SAMPLES
+from jaxbl.estimation import motor_alone
 from jaxbl.report.diagnose import describe_diagnosis
 from jaxbl.report.results import write_report
 
