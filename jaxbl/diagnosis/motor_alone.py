@@ -22,12 +22,13 @@ from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, search_gap
 from jaxbl.estimation.segments import segments_of, signal_sizes
-from jaxbl.estimation.unseen_load import SHOWN, Point, UnseenLoad, is_gap, widths
+from jaxbl.estimation.unseen_load import SHOWN, Point, UnseenLoad, widths
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import percent
 from jaxbl.records import Record
 from jaxbl.workers import announce
 
+from .candidates import EffectNumbers
 from .confidence import Finding
 from .diagnosis_summary import describe_finding, describe_parameters, extended_study
 from .diagnosis_task import DiagnosisTask, input_rms
@@ -64,13 +65,10 @@ class _Search(NamedTuple):
         """The model's own numbers, which are the first."""
         return self.model.free[: len(self.none) - len(self.effects)]
 
-    def path(self, name: str) -> str:
-        """Path of an effect's number."""
-        return self.model.free[self.effects[name]].path
-
-    def frictions(self, out: Sequence[str]) -> list[str]:
-        """Names of the frictions that are not taken out."""
-        return [name for name, i in self.effects.items() if name not in out and not is_gap(self.model.free[i])]
+    @property
+    def play(self) -> list[str]:
+        """Name of the effect that is a gap, if one is sought."""
+        return [name for name, i in self.effects.items() if i == self.model.gap]
 
     def without(self, names: Sequence[str]) -> UnseenLoad:
         """The model in which some effects do nothing."""
@@ -141,36 +139,33 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     done()
     announce("comparing effects")
     history: list[Step] = []
-    plays = [] if gap is None else [name for name, i in search.effects.items() if i == search.model.gap]
     # a gap of its own stays as free as it is
-    out, point = ([], gap.best) if gap is not None and (gap.is_needed or not plays) else (plays, point)
+    out, point = ([], gap.best) if gap is not None and (gap.is_needed or not search.play) else (search.play, point)
     point, gains = _drop_needless(search, point, out, history)
-    gains |= {name: gap.gain for name in plays if gap is not None}
-    absent = [search.effects[name] for name in out]
-    alone = alone_of(search.model, *search.without(out).settle(point), absent, gap, np.e, task.record)
+    gains |= {name: gap.gain for name in search.play if gap is not None}
+    model = search.without(out)
+    alone = alone_of(search.model, *model.settle(point), model.held, gap, np.e, task.record)
     done()
     announce("testing on held-out data")
     # names and numbers stand: only the verdict depends on what was held out
     held_out = task.holdout.open()
-    summary = _summary(task, held_out, search, alone, gains, out) | {"history": describe_history(history)}
-    numbers = {name: _numbers(search, alone, name) for name in search.effects if name not in out}
+    numbers: EffectNumbers = {name: {} for name in search.effects if name not in out}
+    for name, leaves in numbers.items():
+        path = model.free[search.effects[name]].path
+        leaves[path.rpartition(".")[2]] = alone.values[path]
+    summary = _summary(task, held_out, search, alone, gains, numbers) | {"history": describe_history(history)}
     numbers_of_model = {number.path: alone.values[number.path] for number in search.free}
     study = extended_study(task.config, numbers, numbers_of_model, task.record)
     done()
     return study, held_out, summary, pd.DataFrame(columns_alone(task.record, alone))
 
 
-def _numbers(search: _Search, alone: Alone, name: str) -> Numbers:
-    """Numbers of an effect, by name."""
-    path = search.path(name)
-    return {path.rpartition(".")[2]: alone.values[path]}
-
-
 def _drop_needless(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
     """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
     tried goes into the history."""
     while True:
-        points = {name: search.finish(point, [*out, name]) for name in search.frictions(out)}
+        frictions = [name for name in search.effects if name not in (*out, *search.play)]
+        points = {name: search.finish(point, [*out, name]) for name in frictions}
         worth = search.without(out).spread(point).inflation
         gains = {name: _gain(search, name, candidate, point, worth) for name, candidate in points.items()}
         least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
@@ -195,25 +190,22 @@ def _gain(search: _Search, name: str, without: Point, point: Point, inflation: n
 
 
 def _summary(
-    task: DiagnosisTask, held_out: Record, search: _Search, alone: Alone, gains: Numbers, out: Sequence[str]
+    task: DiagnosisTask, held_out: Record, search: _Search, alone: Alone, gains: Numbers, numbers: EffectNumbers
 ) -> JsonObject:
-    """Make `diagnosis.json`, but for the history."""
+    """Make `diagnosis.json`, but for the history; `numbers` of the effects that are left."""
     record, model, values = task.record, search.model, alone.values
     noise, unit = model.noise, record.unit_of("motor.position", "rad")
     deviation = np.sqrt(np.diag(alone.search_fit.spread.covariance))
     errors = dict.fromkeys(values, float("nan"))
     errors |= {number.path: values[number.path] * deviation[i] for i, number in enumerate(alone.search_fit.free)}
     holdout = alone_on_holdout(held_out, alone, search.none)["position"]["motor"]
-    on_log = float(np.sqrt(alone.point.variance))
-    limit = (1.0 + _NOISE_ERROR) * max(on_log, noise)
+    limit = (1.0 + _NOISE_ERROR) * max(alone.point.variance**0.5, noise)
     left, size = model.measure_unexplained(alone.point), input_rms(record)
     # noise of the recorded torque, which is known within a factor of two
     allowed = max(2.0 * model.torque_noise, _LEAST * size)
     changes = zip(search.free, alone.point.theta / task.config.uncertainty.relative, strict=False)
-    far = {number.path: float(z) for number, z in changes if abs(z) > LIMITS.far}
-    names = [
-        name for name, i in search.effects.items() if name not in out and not (alone.doubtful and is_gap(model.free[i]))
-    ]
+    far = {number.path: z for number, z in changes if abs(z) > LIMITS.far}
+    names = [name for name in numbers if not (alone.doubtful and name in search.play)]
     failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
     # where no more is left than a complete model leaves, neither model is better
     worse = bool(failed) and holdout["rms"] > holdout["nominal_rms"]
@@ -229,8 +221,14 @@ def _summary(
     findings = []
     for name in sorted(names, key=lambda name: -gains[name]):
         chance = float(expit(0.5 * (gains[name] - np.log(model.count))))
-        finding = Finding(name, chance, _numbers(search, alone, name), ())
-        weight = {"share": _share(search, alone, name, size), "z": float(np.sqrt(max(gains[name], 0.0)))}
+        # of a friction its level, of a gap what the shaft would take instead
+        (value,), drive = numbers[name].values(), alone.experiment.drive
+        if name in search.play:
+            share = min(value * model.number("transmission.stiffness", alone.point.theta) / size, 1.0)
+        else:
+            share = value / float(drive.ratio(name.partition(".")[0])) / size
+        weight = {"share": share, "z": max(gains[name], 0.0) ** 0.5}
+        finding = Finding(name, chance, numbers[name], ())
         findings.append(describe_finding(record, finding, values, errors, {}) | weight)
     notes = list(record.notes)
     notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
@@ -238,7 +236,6 @@ def _summary(
         fitted_gap = " model.toml has the one that fits best." if alone.gap is not None and alone.gap.is_needed else ""
         notes.append(f"No gap is shown: {alone.reason}.{fitted_gap}")
     part, gap = held_out.segments, gap_summary(alone)
-    times = [float(held_out.time[part[0].start]), float(held_out.time[part[-1].stop - 1])]
     return {
         **task.heading,
         "verdict": judgement.verdict,
@@ -254,7 +251,7 @@ def _summary(
         "gap": {
             "holdout": {
                 "file": str(held_out.path.resolve()), "separate": task.separate, "window": None,
-                "from": times[0], "to": times[1],
+                "from": held_out.time[part[0].start], "to": held_out.time[part[-1].stop - 1],
             },
             "holdout_rmse_before": {"theta_e": holdout["nominal_rms"]},
             "holdout_rmse_after": {"theta_e": holdout["rms"]},
@@ -266,12 +263,3 @@ def _summary(
             "controls": {},
         },
     }  # fmt: skip
-
-
-def _share(search: _Search, alone: Alone, name: str, size: float) -> float:
-    """Torque of an effect over the driving torque: of a friction its level, of a gap what the shaft would take instead."""
-    value, plant = alone.values[search.path(name)], alone.experiment.plant
-    if is_gap(search.model.free[search.effects[name]]):
-        assert plant.transmission is not None
-        return min(value * float(plant.transmission.stiffness) / size, 1.0)
-    return value / float(plant.drive.ratio(name.partition(".")[0])) / size
