@@ -26,9 +26,11 @@ _Table = dict[str, Any]
 """A table of a study, by key."""
 _ROUGH_UNCERTAINTY = 0.5
 """Relative uncertainty of numbers from a rough fit: inertias and stiffness may be split wrongly between the sides."""
+_LARGEST_WHOLE = 100.0
+"""Ratio from which on a whole number has to lie within the errors: ratios of several stages are no whole numbers."""
 _NAME_PATTERNS = {
     "t": r"t|time|timestamp|times|zeit|clock",
-    "u": r"u|torque|tau|moment|drehmoment|force|kraft|current|strom|iq|i_q|voltage|volt|vir|vm",
+    "u": r"u|torque|tau|moment|drehmoment|force|kraft|current|strom|iq|i_q|voltage|volt|vir|vm|effort",
     "load": r"(theta_s|load|output|arm|joint|link|secondary|enc(oder)?_?2)",
     "motor": r"motor",
     "omega": r"(omega|speed|velocity|velo|drehzahl|geschwindigkeit|rpm|vel)",
@@ -55,11 +57,15 @@ _TORQUE_UNITS = {
 def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
     """Split the name of a column: in lower case without its unit, and the unit as `[log]` calls it, "" for none."""
     name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
-    stem, underscore, end = name.rpartition("_")
     if match := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
-        name, unit = name[: match.start()].strip(" _"), unit or match[1]
-    elif underscore and end in _UNIT_NAMES and end not in ("s", "m", "v", "a", "n"):
-        name, unit = stem, unit or end
+        name = name[: match.start()]
+        # what follows without a blank is a unit that is known, or the index or name of an element
+        if match[1] in _UNIT_NAMES or name.endswith(" "):
+            unit = unit or match[1]
+    name = name.strip(" _")
+    stem, underscore, end = name.rpartition("_")
+    if not unit and underscore and end in _UNIT_NAMES and end not in ("s", "m", "v", "a", "n"):
+        name, unit = stem, end
     return name, _UNIT_NAMES.get(unit, unit)
 
 
@@ -114,9 +120,15 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
             continue
         numbers = file.load_values(column)
         # a commanded torque stands for one that was not measured, a side alone for a position
-        if numbers.dtype.kind in "iuf" and (channel == "u" or not is_setpoint):
+        if channel == "t" or (numbers.dtype.kind in "iuf" and (channel == "u" or not is_setpoint)):
             is_second_choice = is_setpoint or _matches("load", name) if channel == "u" else not _matches("position", name)
             candidates.setdefault(channel, []).append((is_second_choice, column, unit, numbers))
+    servo_loads = [candidate for candidate in candidates.get("theta_s", ()) if candidate[1:3] == ("load", "")]
+    if servo_loads and any(not candidate[0] for candidate in candidates.get("theta_e", ())):
+        # beside a named position it is how much a servo is loaded
+        candidates["u"] = servo_loads + candidates.get("u", [])
+        candidates["theta_s"] = [candidate for candidate in candidates["theta_s"] if candidate[1] != "load"]
+        candidates = {channel: columns for channel, columns in candidates.items() if columns}
     table: _Table = {}
     guesses: list[str] = []
     for channel, columns in candidates.items():
@@ -144,6 +156,8 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
 
 
 def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
+    if values.dtype.kind not in "iuf":
+        return {"column": column}
     if unit not in SECONDS_PER_UNIT:
         median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
         # drives are sampled every 10 us to 0.1 s
@@ -208,15 +222,9 @@ def propose_study(
     if log is not None and log.get("kind") == "element":
         raise InputError("--write proposes a drive; a transmission on a test rig has none, and needs only its [log]")
     table, guesses = guess_log_table(path) if log is None else (log, [])
-    try:
-        # a soft shaft changes the ratio of both motions: it is compared with gear_ratio once the stiffness is known
-        inspection = inspect(path, table)
-    except InputError as error:
-        if log is not None or "set sign = -1 in [log] u" not in str(error):
-            raise
-        table["u"]["sign"] = -1
-        guesses.append("u is reversed: with its sign in the file the drive would accelerate against it.")
-        inspection = inspect(path, table)
+    # a soft shaft changes the ratio of both motions: it is compared with gear_ratio once the stiffness is known
+    while (inspection := _inspect_or_mend(path, table, None if log else guesses)) is None:
+        pass
     if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
         rough = _fit_nominal_drive(inspection, guesses, gear_ratio)
         numbers = {name: value for name, value in vars(rough).items() if name not in ("gear_ratio", "dead_time")}
@@ -236,6 +244,20 @@ def propose_study(
     if corrections.get("u.sampled"):
         table["hold"] = "sampled"
     return _make_study(inspection, nominal, table), guesses, inspection
+
+
+def _inspect_or_mend(path: str | Path, table: _Table, guesses: list[str] | None) -> Inspection | None:
+    """Inspect a log; None if it is refused with a remedy, which the table then has, and `guesses` say."""
+    try:
+        return inspect(path, table)
+    except InputError as error:
+        remedy = re.search(r": (.+)[;:] set (\w+) = (-?[\d.e+]+) in \[log\] (\w+)(?! or)", str(error))
+        if guesses is None or remedy is None or remedy[2] in table.get(remedy[4], {remedy[2]}):
+            raise
+        reason, key, value, channel = remedy.groups()
+        table[channel][key] = int(value) if value.lstrip("-").isdecimal() else float(value)
+        guesses.append(f"{channel}.{key} = {value}: {reason}.")
+    return None
 
 
 def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: float | None) -> NominalDrive:
@@ -272,7 +294,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     if known_ratio is not None:
         ratio = known_ratio
     # most ratios of one stage are whole
-    elif whole_ratio and abs(ratio - whole_ratio) < max(0.005 * ratio, 5.0 * float(errors[0])):
+    elif whole_ratio and abs(ratio - whole_ratio) < max(0.005 * ratio * (ratio < _LARGEST_WHOLE), 5.0 * float(errors[0])):
         guesses.append(f"gear_ratio is {ratio:.4g} by the log, and taken to be {whole_ratio:g}.")
         ratio = whole_ratio
     half_inertia = 0.5 * inertia

@@ -35,6 +35,13 @@ COLUMNS = {
     "t, torque_cmd, position": {"u": "torque_cmd", "theta_e": "position"},
     "t, torque_cmd, current, position_cmd, position": {"u": "current", "theta_e": "position"},
     "t, torque, current_position": {"u": "torque", "theta_e": "current_position"},
+    "t, act_pos_deg[0], act_pos_deg[1], torque": {"theta_e": "act_pos_deg[0]", "u": "torque"},
+    "t, /joint_states.position[arm], /joint_states.effort[arm]": {
+        "theta_s": "/joint_states.position[arm]",
+        "u": "/joint_states.effort[arm]",
+    },
+    "t, position, goal_position, speed, load": {"theta_e": "position", "u": "load"},
+    "t, load, pos, temperature": {"theta_e": "pos", "u": "load"},
     "t, force, velocity [counts]": {"u": "force", "omega_e": "velocity [counts]"},
     "t, i_q, motor shaft [deg], output shaft [deg]": {
         "u": "i_q",
@@ -53,6 +60,58 @@ def test_each_quantity_finds_its_column(names, tmp_path):
     assert {channel: keys["column"] for channel, keys in table.items()} == {"t": "t"} | COLUMNS[names]
     assert (table["u"]["column"] == "torque_cmd") == any("the commanded torque" in guess for guess in guesses)
     assert ("[counts]" in names) == any("put in factor" in guess for guess in guesses)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "expected"),
+    [("act_pos_deg[0]", "deg", "deg"), ("pos[3]", "rad", "rad"), ("pos [turn]", "turn", "turn"), ("pos[mm]", "mm", "mm"),
+     ("axis_position_rev(1)", "turn", "turn")],
+)  # fmt: skip
+def test_an_index_is_no_unit(name, unit, expected, tmp_path):
+    pd.DataFrame({"t": 0.01 * np.arange(5), name: 0.1 * np.arange(5)}).to_csv(tmp_path / "log.csv", index=False)
+    table, guesses = guess_log_table(tmp_path / "log.csv")
+    assert table["theta_e"] == {"column": name, "unit": expected}
+    assert any("not given: rad is assumed" in guess for guess in guesses) == (unit == "rad")
+
+
+def test_dates_are_a_time(tmp_path):
+    frame = simulate_log().drop(columns="theta_s")
+    frame["t"] = (pd.Timestamp("2026-03-01") + pd.to_timedelta(frame["t"], unit="s")).astype(str)
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    study, _, inspection = propose_study(tmp_path / "log.csv")
+    assert study["log"]["t"] == {"column": "t"}
+    assert inspection.record.sample_period == pytest.approx(1e-3)
+
+
+def wrap_position(frame):
+    return frame.assign(theta_e=np.degrees(frame["theta_e"]) % 360.0).rename(columns={"theta_e": "position_deg"})
+
+
+def write_unsigned_words(frame):
+    return frame.assign(load=np.round(1e3 * frame["u"]).astype(int) % 65536).drop(columns="u")
+
+
+@pytest.mark.parametrize(
+    ("write", "channel", "key", "value"),
+    [(wrap_position, "theta_e", "wrap", 360), (write_unsigned_words, "u", "signed_bits", 16)],
+)
+def test_what_a_refusal_asks_for_is_taken(write, channel, key, value, tmp_path):
+    """The remedy stands in the proposed table, with the reason, and the log is read by it."""
+    write(simulate_log(count=8000).drop(columns="theta_s")).to_csv(tmp_path / "log.csv", index=False)
+    study, guesses, _ = propose_study(tmp_path / "log.csv")
+    assert study["log"][channel][key] == value
+    assert sum(guess.startswith(f"{channel}.{key} = {value}: column ") for guess in guesses) == 1
+    read_model(study)
+
+
+@pytest.mark.parametrize(("ratio", "expected"), [(19.97, 20.0), (99.8, 100.0), (256.9, 256.9), (143.2, 143.2)])
+def test_a_large_ratio_is_a_whole_number_only_within_its_errors(ratio, expected, tmp_path):
+    frame = simulate_log(noise=1e-6)
+    frame["theta_s"] = frame["theta_e"] / ratio
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    study, guesses, _ = propose_study(tmp_path / "log.csv")
+    assert study["drive"]["gear_ratio"] == pytest.approx(expected, rel=1e-3)
+    assert any("gear_ratio is" in guess for guess in guesses) == (expected != ratio)
 
 
 def test_a_speed_beside_a_position_needs_no_offset(tmp_path):
@@ -94,7 +153,7 @@ def test_a_reversed_torque_and_stamps_in_ms(tmp_path):
     frame.assign(t=1e3 * frame["t"], u=-frame["u"]).to_csv(tmp_path / "log.csv", index=False)
     study, guesses, inspection = propose_study(tmp_path / "log.csv")
     assert study["log"]["u"]["sign"] == -1 and study["log"]["t"]["unit"] == "ms"
-    assert any("u is reversed" in guess for guess in guesses)
+    assert any(guess.startswith("u.sign = -1: ") for guess in guesses)
     assert inspection.record.sample_period == pytest.approx(1e-3)
     config, _ = read_model(study)
     assert config.drive.motor_inertia == pytest.approx(INERTIA, rel=0.02)
