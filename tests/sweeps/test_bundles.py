@@ -197,6 +197,25 @@ def test_a_scheduler_that_is_lost_is_said():
             _GO_ON.set()
 
 
+def test_workers_are_waited_for_and_not_for_ever(monkeypatch):
+    monkeypatch.setattr("jaxbl.cluster._WORKERS_SECONDS", 0.5)
+    said = []
+    with (
+        LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as cluster,
+        Client(cluster, set_as_default=False) as connection,
+        connect(connection) as workers,
+        subscribe(said.append),
+    ):
+        with pytest.raises(NoResult, match=r"^no worker has come for 0\.5 s; what is finished is kept, and the same command"):
+            list(workers.map_jobs(_wait_to_go_on, [False]))
+        assert set(said) == {"waiting for workers: the scheduler has none"}
+        # one that comes late is welcome
+        monkeypatch.setattr("jaxbl.cluster._WORKERS_SECONDS", 60.0)
+        results = workers.map_jobs(_wait_to_go_on, [False])
+        Timer(1.0, cluster.scale, [1]).start()
+        assert list(results) == [False]
+
+
 def listen_silently(folder):
     server = socket.create_server(("127.0.0.1", 0))
     return f"tcp://127.0.0.1:{server.getsockname()[1]}", server
