@@ -294,10 +294,11 @@ class Stream:
 
         A row at the end that is far from the one before is held until the next one has come.
         """
-        recent = self._recent.shape[1]
-        samples = np.concatenate([self._recent, self._held, samples], axis=1)
-        steps = reader.steps(samples)
-        if steps.shape[1] > 1:
+        known = self._recent.shape[1]
+        samples, self._held = np.concatenate([self._recent, self._held, samples], axis=1), samples[:, :0]
+        is_new = np.arange(samples.shape[1]) >= known
+        if samples.shape[1] > 2:
+            steps = reader.steps(samples)
             sizes = np.abs(steps)
             usual = np.quantile(sizes, _USUAL_STEPS, axis=1)
             # at standstill: a count
@@ -305,17 +306,14 @@ class Stream:
             limits = _OUTLIER_STEPS * np.where(usual > 0.0, usual, least)
             limits[0] = max(_RESTART_SECONDS, GAP_PERIODS * self._period)
             is_far = sizes > limits[:, None]
-            is_outlier = np.any(is_far[:, :-1] & is_far[:, 1:] & (steps[:, :-1] * steps[:, 1:] < 0.0), axis=0)
-            is_outlier[: max(recent - 1, 0)] = False
-            is_first_outlier = recent == 0 and sizes.shape[1] > 2 and (is_far[:, 0] & ~is_far[:, 1]).any()
-            is_kept = np.concatenate([[not is_first_outlier], ~is_outlier, [True]])
-            end = samples.shape[1] - int(is_far[:, -1].any() and is_kept[-2])
-            self._held = samples[:, end:]
-            self._count(OUTLIERS, int(np.count_nonzero(is_outlier)) + int(is_first_outlier))
-            is_kept[:recent] = False
-            new = samples[:, :end][:, is_kept[:end]]
-        else:
-            self._held, new = samples[:, :0], samples[:, recent:]
+            goes_back = is_far[:, :-1] & is_far[:, 1:] & (steps[:, :-1] * steps[:, 1:] < 0.0)
+            # the first row has one neighbour
+            is_outlier = np.vstack([is_far[:, 0] & ~is_far[:, 1], goes_back.T, is_far[:, 0] & False]).any(axis=1) & is_new
+            if is_far[:, -1].any() and not is_outlier[-2]:
+                self._held, is_new[-1] = samples[:, -1:], False
+            self._count(OUTLIERS, int(is_outlier.sum()))
+            is_new &= ~is_outlier
+        new = samples[:, is_new]
         self._recent = np.concatenate([self._recent, new], axis=1)[:, -_RECENT_ROWS:]
         return new
 

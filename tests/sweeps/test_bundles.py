@@ -206,7 +206,7 @@ def test_workers_are_waited_for_and_not_for_ever(monkeypatch):
         connect(connection) as workers,
         subscribe(said.append),
     ):
-        with pytest.raises(NoResult, match=r"^no worker has come for 0\.5 s; what is finished is kept, and the same command"):
+        with pytest.raises(NoResult, match=r"^no worker has come for 0\.5 s; what is finished is kept"):
             list(workers.map_jobs(_wait_to_go_on, [False]))
         assert set(said) == {"waiting for workers: the scheduler has none"}
         # one that comes late is welcome
