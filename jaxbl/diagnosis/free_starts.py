@@ -146,9 +146,7 @@ def _search_starts(model: _Model, passes: int, at_rest: bool, within: np.ndarray
             damping[:] = RIDGE
         indices = np.flatnonzero(going)
         if not len(indices):
-            if at_rest and i <= passes // 2:
-                continue
-            break
+            continue
         new_states = model.states(following[indices], indices)
         value = model.residual(new_states, indices)
         squares = np.sum(value[:, :scored] ** 2, axis=(1, 2))
@@ -163,9 +161,7 @@ def _search_starts(model: _Model, passes: int, at_rest: bool, within: np.ndarray
                 stored[new] = new_state[better]
             slope[new] = model.slope([new_state[better] for new_state in new_states], new) * fitted[new][:, None, None, :]
         flat = slope[indices][:, :scored].reshape(len(indices), -1, count)
-        size = np.sqrt(np.sum(flat**2, axis=1))
-        # a state without influence stays where it is
-        size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
+        size = _sizes(flat)
         unit = flat / size[:, None, :]
         towards = np.einsum("wrn,wr->wn", unit, residual[indices][:, :scored].reshape(len(indices), -1))
         matrix = unit.transpose(0, 2, 1) @ unit + damping[indices][:, None, None] * np.eye(count)
@@ -173,12 +169,17 @@ def _search_starts(model: _Model, passes: int, at_rest: bool, within: np.ndarray
         following[indices] = best[indices] - change / size
         going[indices] = ~(np.einsum("wn,wn->w", change, towards) <= _SETTLED * cost[indices])
     first = slope[:, :scored].reshape(runs, -1, count)
-    size = np.sqrt(np.sum(first**2, axis=1))
-    # a state that the samples seen do not show stays where it is, and adds no noise
-    size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)[:, None, :]
+    size = _sizes(first)[:, None, :]
     unit, first = slope / size[:, :, None, :], first / size
     inverse = np.linalg.pinv(np.where(np.isfinite(first), first, 0.0), rcond=_RANK)
     change = np.einsum("wnr,wr->wn", inverse, residual[:, :scored].reshape(runs, -1))
     left = residual - np.einsum("wrsn,wn->wrs", unit, change)
     spread = np.einsum("wrsn,wnm,wrsm->wrs", unit[:, scored:], inverse @ inverse.transpose(0, 2, 1), unit[:, scored:])
     return Run(left, shape.unflatten(states), np.sqrt(np.mean(spread, axis=(0, 1))))
+
+
+def _sizes(columns: np.ndarray) -> np.ndarray:
+    """Influence of each state of a window, shape (windows, states), by columns of shape (windows, rows, states); infinite
+    where there is none: what the samples do not show stays where it is, and adds no noise."""
+    size = np.sqrt(np.sum(columns**2, axis=1))
+    return np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)

@@ -242,15 +242,20 @@ def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
     return jnp.convolve(values, jnp.asarray(firwin(20 * factor + 1, 1.0 / factor), values.dtype), "valid")[::factor]
 
 
-def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
-    """Measure how far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
+def _decimate_balances(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, Balance]:
+    """Equations of motion after decimation, all parts one after the other."""
     balances: dict[str, list[Balance]] = {}
     for part in parts:
-        for name, sample in jit(balance)(experiment, part).items():
-            balances.setdefault(name, []).append(Balance(decimate(sample.residual, factor), decimate(sample.drive, factor)))
+        for name, equation in jit(balance)(experiment, part).items():
+            balances.setdefault(name, []).append(Balance(*(decimate(torque, factor) for torque in equation)))
+    return {name: Balance(*map(jnp.concatenate, zip(*pieces, strict=True))) for name, pieces in balances.items()}
+
+
+def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
+    """Measure how far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
     figures = {}
-    for name, pieces in balances.items():
-        left, drive = (float(jnp.sqrt(jnp.mean(jnp.concatenate(x) ** 2))) for x in zip(*pieces, strict=True))
+    for name, equation in _decimate_balances(experiment, parts, factor).items():
+        left, drive = (float(jnp.sqrt(jnp.mean(torque**2))) for torque in equation)
         figures[name] = {"rms": left, "relative": left / drive if drive > 0.0 else float("nan")}
     return figures
 
@@ -281,24 +286,17 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
     largest share, of those that surely predict the torque in each tenth of the log by its means in eight ranges in the other
     tenths; None if there is none.
     """
-    torques: dict[str, list[np.ndarray]] = {}
-    channels: dict[tuple[str, str], list[np.ndarray]] = {}
-    for part in parts:
-        for side, left in jit(balance)(experiment, part).items():
-            if side not in experiment.sides:
-                continue
-            torques.setdefault(side, []).append(np.asarray(decimate(left.residual, factor)))
-            for name, values in (("velocity", part.velocity[side]), ("position", part.position[side])):
-                channels.setdefault((side, name), []).append(np.asarray(decimate(jnp.asarray(values), factor)))
     shares = []
-    # in each range and block some samples
-    if sum(map(len, torques.get("motor", []))) < 2 * _BLOCKS * _BINS:
-        return None
-    for (side, name), pieces in channels.items():
-        torque, values = np.concatenate(torques[side]), np.concatenate(pieces)
-        gains = _gains_by_ranges(torque - np.mean(torque), values)
-        if np.mean(gains) > _SURE * np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
-            shares.append(MotionShare(side, name, float(np.mean(gains) / np.var(torque))))
+    for side, equation in _decimate_balances(experiment, parts, factor).items():
+        torque = np.asarray(equation.residual)
+        # in each range and block some samples
+        if side not in experiment.sides or len(torque) < 2 * _BLOCKS * _BINS:
+            continue
+        for name in ("velocity", "position"):
+            values = [decimate(jnp.asarray(getattr(part, name)[side]), factor) for part in parts]
+            gains = _gains_by_ranges(torque - np.mean(torque), np.concatenate(values))
+            if np.mean(gains) > _SURE * np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
+                shares.append(MotionShare(side, name, float(np.mean(gains) / np.var(torque))))
     return max(shares, key=lambda share: share.share, default=None)
 
 
