@@ -116,12 +116,8 @@ def draw_certificates(summary: JsonObject) -> list[Figure]:
 
 
 def _bounds(side: str, proof: JsonObject) -> Figure:
-    time, bound, start, worst = (
-        proof["curve"]["time"],
-        proof["curve"]["bound"],
-        proof["reaching_time"],
-        proof["search"]["worst"],
-    )
+    (time, bound), start = (proof["curve"][name] for name in ("time", "bound")), proof["reaching_time"]
+    worst = proof["search"]["worst"]
     # beyond its last point the bound stays as it is
     end = max(1.3 * start, time[-1], 20.0 * proof["assumptions"]["period"])
     parts = [

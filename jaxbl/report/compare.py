@@ -18,7 +18,23 @@ from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
 from .maps import axis_of, cell_edges, colour_scale, is_log, path_words, value_label
-from .panels import BLUE, COLOURS, MISSING, Array, Axis, Dots, Figure, Line, Map, Panel, Part, Scale, Span, intervals
+from .panels import (
+    BLUE,
+    COLOURS,
+    MISSING,
+    Array,
+    Axis,
+    Dots,
+    Figure,
+    Line,
+    Map,
+    Panel,
+    Part,
+    Scale,
+    Span,
+    intervals,
+    name_rows,
+)
 
 _PANELS = 3
 _ROWS = 12
@@ -44,14 +60,9 @@ def tabulate_points(comparison: Comparison) -> pd.DataFrame:
         if change.count:
             frame = comparison.frame(change.metric)
             columns |= {path: frame[path] for path in comparison.axes}
-            first, second = frame["first"].astype(float), frame["second"].astype(float)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                factor = second - first if is_boolean(change.metric) else second / first
-            columns |= {
-                f"{change.metric}.factor": factor,
-                f"{change.metric}.first": first,
-                f"{change.metric}.second": second,
-            }
+            numbers = frame[["first", "second"]].astype(float)
+            numbers["factor"] = _divide(numbers, change.metric)
+            columns |= {f"{change.metric}.{name}": column for name, column in numbers.items()}
     return pd.DataFrame(columns)
 
 
@@ -206,9 +217,14 @@ def draw_comparison(comparison: Comparison) -> list[Figure]:
 
 def _change(frame: pd.DataFrame, metric: str) -> Any:
     """The factor at each point, NaN where there is none; of what is true or false the difference."""
+    return _divide(frame, metric).replace([np.inf] if is_boolean(metric) else [np.inf, 0.0], np.nan)
+
+
+def _divide(frame: pd.DataFrame, metric: str) -> Any:
+    """The second number over the first; of what is true or false the second less the first."""
+    first, second = frame["first"], frame["second"]
     with np.errstate(divide="ignore", invalid="ignore"):
-        change = frame["second"] - frame["first"] if is_boolean(metric) else frame["second"] / frame["first"]
-    return change.replace([np.inf] if is_boolean(metric) else [np.inf, 0.0], np.nan)
+        return second - first if is_boolean(metric) else second / first
 
 
 def _spread(frame: pd.DataFrame, metric: str) -> float:
@@ -230,10 +246,9 @@ def _factors(frames: dict[str, pd.DataFrame], means: dict[str, float]) -> list[F
         return []
     places = list(range(len(rows)))
     parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(places, *zip(*rows.values(), strict=True), colour=BLUE)]
-    y = Axis(ends=(len(rows) - 0.5, -0.5), names=tuple(enumerate(rows)))
     caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
     x = Axis("factor from the first study to the second", log=True)
-    return [Figure("factors", [Panel(x, y, parts)], caption, height=0.9 + 0.3 * len(rows))]
+    return [Figure("factors", [Panel(x, name_rows(list(rows)), parts)], caption, height=0.9 + 0.3 * len(rows))]
 
 
 def _map(config: Config, metric: MetricChange, frame: pd.DataFrame, axes: list[str], beyond: str) -> Panel:

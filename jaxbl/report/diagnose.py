@@ -20,6 +20,7 @@ from .panels import (
     FAINT,
     MISSING,
     ORANGE,
+    TIME,
     VERMILION,
     ZERO,
     Axis,
@@ -31,6 +32,8 @@ from .panels import (
     Span,
     missing_label,
     missing_quantity,
+    name_rows,
+    place_words,
     stack,
     with_unit,
 )
@@ -52,7 +55,10 @@ def describe_diagnosis(summary: JsonObject) -> Result:
     """Say what the model lacks, how sure that is, and how much better it is with it, from a `diagnosis.json`."""
     verdict, headline = _verdict(summary)
     tables = [table for table in (_finding_table(summary), _history_table(summary)) if table.rows]
-    tables += [_gap_table(summary["gap"]), _number_table(summary)]
+    tables += [
+        _gap_table(summary["gap"]),
+        number_table("Parameters of the model", read_quantities(summary["parameters"])),
+    ]
     title = summary["title"] or f"Diagnosis of {Path(summary['file']).name}"
     details = [*_gap_lines(summary["gap"]), *_remarks(summary)]
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), _reasons(summary), details, tables))
@@ -393,10 +399,6 @@ def _limits(gap: JsonObject) -> dict[str, float | None]:
     return {name: error["limit"] for name, error in gap["expected"].items()}
 
 
-def _number_table(summary: JsonObject) -> ResultTable:
-    return number_table("Parameters of the model", read_quantities(summary["parameters"]))
-
-
 def draw_diagnosis(diagnosis: Diagnosis) -> list[Figure]:
     """All figures of a diagnosis."""
     if not diagnosis.located:
@@ -469,8 +471,7 @@ def _gap_panel(gap: JsonObject) -> Panel:
         f"{_CHANNELS[name]}\n{rms_text(start)} → {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]}"
         for name, start in gap["holdout_rmse_before"].items()
     ]
-    y = Axis(ends=(len(names) - 0.4, -0.6), names=tuple(enumerate(labels)))
-    return Panel(Axis("rms error on held-out data over noise", log=True, ends=ends), y, parts)
+    return Panel(Axis("rms error on held-out data over noise", log=True, ends=ends), name_rows(labels), parts)
 
 
 def _chances_panel(candidates: list[tuple[str, JsonObject, bool]]) -> Panel:
@@ -479,7 +480,7 @@ def _chances_panel(candidates: list[tuple[str, JsonObject, bool]]) -> Panel:
         for row, (_, effect, is_found) in enumerate(candidates)
     ]
     texts = [f"{name}: {probability(effect['confidence'])}" for name, effect, _ in candidates]
-    names = Line([0.0] * len(texts), np.arange(len(texts)) - 0.36, width=0.0, marker=" ", texts=texts)
+    names = place_words([0.0] * len(texts), np.arange(len(texts)) - 0.36, texts)
     y = Axis(ends=(max(len(candidates), 3) - 0.4, -0.8), names=((-9.0, ""),))
     return Panel(Axis("confidence", ends=(0.0, 1.0)), y, [*bars, names], note="" if candidates else "no effect named")
 
@@ -494,7 +495,7 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
                 parts.append(Span(before.time[0], before.time[-1], "held out", ORANGE, opacity=0.18))
             parts += torque_parts(before, bandwidth, "before", noise=False, colour=_BEFORE, width=2.6, opacity=0.6)
             parts += torque_parts(after, bandwidth, "after", colour=_AFTER, width=0.9)
-        panels.append(Panel(Axis("time (s)"), Axis(missing_label(f"{side}:\n", unit)), parts))
+        panels.append(Panel(TIME, Axis(missing_label(f"{side}:\n", unit)), parts))
     lead = f"Held-out log {diagnosis.holdout.path.name}: t" if diagnosis.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
         f"{lead}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "

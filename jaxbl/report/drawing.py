@@ -342,8 +342,7 @@ def _draw_dots(ax: Axes, dots: Dots, layer: float) -> None:
 
 
 def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
-    draw = ax.bar if bars.upright else ax.barh
-    draw(bars.places, bars.lengths, bars.thickness, color=bars.colour, alpha=bars.opacity, zorder=layer)
+    ax.barh(bars.places, bars.lengths, bars.thickness, color=bars.colour, alpha=bars.opacity, zorder=layer)
     for place, length, text in zip(bars.places, bars.lengths, bars.texts):  # noqa: B905
         ax.annotate(f" {_plain(text)}", (length, place), va="center", fontsize=9)
 

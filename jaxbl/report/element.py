@@ -11,7 +11,7 @@ from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
 from .numbers import lead_with_doubt, number_figures, number_table, write_fit
-from .panels import BLUE, ORANGE, Axis, Figure, Line, Panel, Part, Span, cloud, join, missing_quantity, stack
+from .panels import BLUE, ORANGE, TIME, Axis, Figure, Line, Panel, Part, Span, cloud, join, missing_quantity, stack
 
 
 def write_element(result: ElementIdentification, folder: Path) -> str:
@@ -65,7 +65,7 @@ def draw_element(result: ElementIdentification) -> list[Figure]:
     loop = Panel(Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})"), parts)
     time, *signals = join(time, record.segments, u, u - fitted)
     panels = [
-        Panel(Axis("time (s)"), Axis(f"{label}\n({torque_unit})"), [Line(time, signal, colour=BLUE, width=0.9)])
+        Panel(TIME, Axis(f"{label}\n({torque_unit})"), [Line(time, signal, colour=BLUE, width=0.9)])
         for signal, label in zip(signals, ("torque", "not explained"), strict=True)
     ]
     return [

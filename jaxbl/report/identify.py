@@ -39,7 +39,8 @@ def describe_identification(summary: JsonObject) -> Result:
         tables.append(ResultTable("Recursive identification, at the end of the log", columns, rows))
     remarks = [*summary["warnings"], *_far_off(parameters)]
     if lacks := (summary.get("rejected") or {}).get("lacks"):
-        remarks.append(_lacking(**lacks))
+        lead = f"{percent(lacks['share'])} of the torque left over on the {lacks['equation']}"
+        remarks.append(f"{lead} goes with its {lacks['channel']}: an effect is missing.")
     remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
     title = summary["title"] or f"Identification from {Path(summary['file']).name}"
     figures = [*_backlash(summary), *number_figures(numbers)][:4]
@@ -59,11 +60,6 @@ def _far_off(parameters: Mapping[str, Quantity]) -> Lines:
         if path.endswith(("inertia", ".stiffness")) and (number.factor <= 1.0 / _FAR or number.factor >= _FAR)
     ]
     return [f"{DOUBT}{', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
-
-
-def _lacking(equation: str, channel: str, share: float) -> str:
-    """Say with what motion the torque goes that a model lacks."""
-    return f"{percent(share)} of the torque left over on the {equation} goes with its {channel}: an effect is missing."
 
 
 def _backlash(summary: JsonObject) -> list[KeyFigure]:

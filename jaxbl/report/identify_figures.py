@@ -22,6 +22,7 @@ from .panels import (
     PURPLE,
     SIDE_COLOURS,
     SKY,
+    TIME,
     ZERO,
     Array,
     Axis,
@@ -36,6 +37,7 @@ from .panels import (
     join,
     limits,
     missing_quantity,
+    name_rows,
     shade_gap,
     stack,
     with_unit,
@@ -85,12 +87,11 @@ def _intervals(result: Identification) -> Figure:
         Line(np.zeros(len(held)), places[count:], colour=FAINT, width=0.0, marker="o", fill="#FFFFFF"),
     ]
     x = Axis("difference from the nominal value (% of it)", ends=(min(inside) - room, max(inside) + room))
-    y = Axis(ends=(len(names) - 0.5, -0.5), names=tuple(enumerate(names)))
     caption = (
         "Fitted parameters as differences from their nominal values (the line at 0), with 95 % intervals that allow for "
         "correlated residuals; below each name its value, half width of the interval, and its share of the value."
     )
-    return Figure("intervals", [Panel(x, y, drawn)], caption, height=0.9 + 0.45 * len(names))
+    return Figure("intervals", [Panel(x, name_rows(names), drawn)], caption, height=0.9 + 0.45 * len(names))
 
 
 def _residuals(log: LogSignals) -> Figure:
@@ -100,7 +101,7 @@ def _residuals(log: LogSignals) -> Figure:
         name = f"rms {rms:.2g} {unit}, {rms / noise:.3g} times the noise"
         parts = [_line(log, log[f"{side}.residual"], name, colour=SIDE_COLOURS[side], width=0.7)]
         parts += [Span(end, end, "± 2 noise", along="y", width=0.9) for end in (-2.0 * noise, 2.0 * noise)]
-        panels.append(Panel(Axis("time (s)"), Axis(f"{side}: measured\n− model ({unit})"), parts))
+        panels.append(Panel(TIME, Axis(f"{side}: measured\n− model ({unit})"), parts))
     return stack(
         "residuals",
         panels,
@@ -112,7 +113,7 @@ def _residuals(log: LogSignals) -> Figure:
 
 def _pair(log: LogSignals, above: tuple[Axis, list[Part]], below: tuple[Axis, list[Part]]) -> list[Panel]:
     """Signals in detail, and below their differences over the whole record."""
-    axes, marked = [Axis("time (s)")] * 2, []
+    axes, marked = [TIME] * 2, []
     if not log.whole:
         ends = float(log.time[0]), float(log.time[-1])
         axes = [Axis("time (s)", ends=log.span), Axis("time (s), all of the record", ends=ends)]
@@ -314,7 +315,7 @@ def _path(log: LogSignals) -> Figure:
             ends.append(np.array(fitted.ends()))
         label = with_unit(name.replace("_", " "), result.record.unit_of(path, units.get(name, "rad")))
         inside = [] if fitted is None else [fitted.value]
-        panels.append(Panel(Axis("time (s)"), Axis(label, ends=limits(*ends, share=0.02, room=0.25, inside=inside)), parts))
+        panels.append(Panel(TIME, Axis(label, ends=limits(*ends, share=0.02, room=0.25, inside=inside)), parts))
     return stack(
         "recursive",
         panels,

@@ -21,6 +21,7 @@ from .panels import (
     FAINT,
     GREEN,
     PURPLE,
+    TIME,
     VERMILION,
     ZERO,
     Axis,
@@ -52,8 +53,9 @@ def write_inspection(inspection: Inspection, folder: Path) -> str:
 def describe_inspection(inspection: Inspection) -> Result:
     """Say what the log can identify, and what is wrong with it."""
     record, by_answer = inspection.record, {}
-    for judged in inspection.identifiability:
-        by_answer.setdefault(judged.answer, []).append(judged.quantity)
+    judgements = [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
+    for quantity, answer, _ in judgements:
+        by_answer.setdefault(answer, []).append(quantity)
     parts = [
         f"{lead} {', '.join(by_answer[answer])}"
         for answer, lead in (("yes", "shows"), ("weak", "hardly shows"), ("no", "does not show"))
@@ -75,15 +77,11 @@ def describe_inspection(inspection: Inspection) -> Result:
         if name.startswith("theta")
     ]
     tables = [
-        ResultTable("What the log can identify", ["quantity", "", "why"], _judgements(inspection)),
+        ResultTable("What the log can identify", ["quantity", "", "why"], judgements),
         ResultTable("Channels", head, rows),
     ]
     remarks, headline = [*record.warnings, inspection.describe_sizes()], f"The log {'; it '.join(parts)}."
     return lead_with_doubt(Result(record.path.name, verdict, headline, figures, remarks, record.notes, tables))
-
-
-def _judgements(inspection: Inspection) -> list[tuple[str, str, str]]:
-    return [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
 
 
 def _channel_table(record: Record) -> list[tuple[str, ...]]:
@@ -125,7 +123,7 @@ def _channels(record: Record) -> Figure:
     signals.append((compute_velocity(record, side), f"{side} velocity", PURPLE, unit))
     time, *joined = join(record.time, record.segments, *(signal for signal, *_ in signals))
     panels = [
-        Panel(Axis("time (s)"), Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
+        Panel(TIME, Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
         for values, (_, label, colour, unit) in zip(joined, signals, strict=True)
     ]
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
@@ -219,6 +217,6 @@ def _intervals(record: Record) -> Figure:
     bars = Bars(0.5 * (edges[1:] + edges[:-1]), counts, thickness=edges[1] - edges[0])
     stamps = [cloud(times, lengths, colour=BLUE), Span(1e3 * median, 1e3 * median, "median", VERMILION, "y")]
     y = Axis("interval\n(ms)")
-    panels = [Panel(Axis("time (s)"), y, stamps), Panel(Axis("samples (1)"), y, [bars])]
+    panels = [Panel(TIME, y, stamps), Panel(Axis("samples (1)"), y, [bars])]
     caption = "Intervals between raw time stamps, before resampling; gaps are left out."
     return Figure("intervals", panels, caption, 2, height=2.6, widths=(3.0, 1.0))

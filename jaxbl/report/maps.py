@@ -162,6 +162,12 @@ def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -
     return Axis(axis_label(config, path), path, log, (low, high))
 
 
+def axis_words(config: Config, path: str) -> dict[str, str]:
+    """Path, label and unit of an axis, for a page."""
+    label = path if path == "seed" else axis_label(config, path)
+    return {"path": path, "label": label, "unit": unit_of(config, path)}
+
+
 def unit_of(config: Config, path: str) -> str:
     """The unit of what an axis varies; none of words."""
     parameter = numeric_paths(config).get(path)
@@ -322,7 +328,7 @@ def _map_panels(
             table=part["table"],
             finite=part["finite"],
             converged=part.get(f"{side}.converged"),
-            best=errors and _place_of_best(errors[value]),
+            best=(best := errors and best_gains(errors[value])) and errors[value].index[best.index],
             bound=None if bounds is None else float(bounds.iloc[i]),
             dots=dots and dots[value],
         )
@@ -337,18 +343,18 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points | None)
     side = spec.x.split(".")[1]
     converged, bound = f"{side}.converged", f"{side}.f_plus"
     paths = [] if points is None or points.refinement is None else points.refinement.paths
-    needs = [converged, bound, *paths]
-
-    def is_bounded(frame: DataFrame) -> Series:
-        # most points of a refined study lie at its boundary: the median is that of the coarse grid
-        return frame[bound].notna() & (True if points is None else points.on_coarse_grid(frame))
-
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
-    good = Column(needs, lambda frame: frame[bound].where(is_bounded(frame) & frame[converged].astype(bool)))
-    medians = groups.medians(good)
-    if medians.isna().any():
-        medians = medians.fillna(groups.medians(Column(needs, lambda frame: frame[bound].where(is_bounded(frame)))))
-    return medians
+
+    def medians(converged_alone: bool) -> Series:
+        def bounds(frame: DataFrame) -> Series:
+            # most points of a refined study lie at its boundary: the median is that of the coarse grid
+            there = frame[converged].astype(bool) | (not converged_alone)
+            return frame[bound].where(there if points is None else there & points.on_coarse_grid(frame))
+
+        return groups.medians(Column([converged, bound, *paths], bounds))
+
+    found = medians(True)
+    return found.fillna(medians(False)) if found.isna().any() else found
 
 
 def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> tuple[list[Panel], str]:
@@ -459,11 +465,6 @@ def worst_runs(groups: Groups, value: str, has_margin: bool) -> DataFrame:
     if has_margin:
         means["margin_alpha"] = groups.spread(_number_column(f"{side}.margin_alpha")).least
     return means.assign(error=groups.spread(column).largest, scatter=scatter)
-
-
-def _place_of_best(runs: DataFrame) -> Pair | None:
-    best = best_gains(runs)
-    return None if best is None else runs.index[best.index]
 
 
 def best_gains(runs: DataFrame) -> BestGains | None:

@@ -22,7 +22,22 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .maps import axis_label, axis_of, cell_edges, with_value
-from .panels import COLOURS, SIDE_COLOURS, Axis, Figure, Line, Map, Panel, Part, Scale, Span, arrange, intervals
+from .panels import (
+    COLOURS,
+    SIDE_COLOURS,
+    Axis,
+    Figure,
+    Line,
+    Map,
+    Panel,
+    Part,
+    Scale,
+    Span,
+    arrange,
+    intervals,
+    name_rows,
+    place_words,
+)
 from .tune import error_label, for_title
 
 
@@ -56,11 +71,10 @@ def _ratios(summary: JsonObject, sides: Sequence[str]) -> Figure:
         parts: list[Part] = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
             *intervals(range(len(compared)), low, ratio, high, colour=SIDE_COLOURS[side]),
-            Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
+            place_words([*high, *[0.9] * len(lost)], range(len(kinds)), texts),
         ]
         x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + highest) ** 1.5))
-        names = tuple(enumerate([*compared, *lost]))
-        panels.append(Panel(x, Axis(ends=(len(kinds) - 0.5, -0.5), names=names), parts, side))
+        panels.append(Panel(x, name_rows([*compared, *lost]), parts, side))
     caption = (
         f"{error_label(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with "
         "its 95 % interval where they differ."

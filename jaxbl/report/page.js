@@ -17,9 +17,9 @@ const cellOf = (edges, value) => {
 const found = (panel, at, size) => {
   const axes = [panel.x, panel.y], [x, y] = axes.map(along), here = [x.value(at[0] / size[0]), y.value(1 - at[1] / size[1])];
   const said = (values, order = [0, 1]) => order.map((i) => saidOf(axes[i], values[i])).filter(Boolean);
-  const inside = (low, length, value) => (value - low) * (value - low - length) <= 0, lies = panel.y.names;
+  const inside = (low, length, value) => (value - low) * (value - low - length) <= 0;
   const bar = panel.bars.find(([left, bottom, width, height]) => inside(left, width, here[0]) && inside(bottom, height, here[1]));
-  if (bar) return { text: said([bar[0] + bar[2] / (lies ? 1 : 2), bar[1] + bar[3] / (lies ? 2 : 1)], lies ? [1, 0] : [0, 1]) };
+  if (bar) return { text: said([bar[0] + bar[2], bar[1] + bar[3] / 2], [1, 0]) };
   if (panel.cells) {
     const { edges, values, name } = panel.cells, [i, j] = edges.map((one, k) => cellOf(one, here[k]));
     // the point that the cell is drawn around

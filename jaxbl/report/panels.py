@@ -55,6 +55,14 @@ class Axis(NamedTuple):
     ratio: tuple[float, str] | None = None
 
 
+TIME = Axis("time (s)")
+
+
+def name_rows(names: Sequence[str]) -> Axis:
+    """An axis of rows from the top down, each with a name."""
+    return Axis(ends=(len(names) - 0.5, -0.5), names=tuple(enumerate(names)))
+
+
 class Line(NamedTuple):
     """A line through points `(n,)`, NaN where it breaks, or points alone.
 
@@ -150,14 +158,13 @@ class Dots(NamedTuple):
 
 
 class Bars(NamedTuple):
-    """Bars from 0 at places `(n,)`, lying unless `upright`, with words at their ends."""
+    """Lying bars from 0 at places `(n,)`, with words at their ends."""
 
     places: Any
     lengths: Any
     name: str = ""
     colour: str = BLUE
     thickness: float = 0.6
-    upright: bool = False
     opacity: float = 1.0
     texts: Sequence[str] = ()
 
@@ -239,6 +246,11 @@ def cloud(x: Any, y: Any, name: str = "", colour: str = FAINT, **how: Any) -> Li
 
 ZERO = Span(0.0, 0.0, colour=FAINT, along="y", width=0.8, dashes="-")
 """A faint line at y = 0."""
+
+
+def place_words(x: Any, y: Any, texts: Sequence[str]) -> Line:
+    """Words beside places."""
+    return Line(x, y, width=0.0, marker=" ", texts=texts)
 
 
 def shade_gap(half: float, name: str) -> Span:
@@ -379,11 +391,8 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         elif isinstance(part, Span):
             content["spans"].append(part._asdict())
         elif isinstance(part, Bars):
-            corners = [
-                (place - part.thickness / 2.0, 0.0, part.thickness, length) if part.upright
-                else (0.0, place - part.thickness / 2.0, length, part.thickness)
-                for place, length in zip(part.places, part.lengths, strict=True)
-            ]  # fmt: skip
+            ends = zip(part.places, part.lengths, strict=True)
+            corners = [(0.0, place - part.thickness / 2.0, length, part.thickness) for place, length in ends]
             content["bars"] += [[float(f"{number:.6g}") for number in bar] for bar in corners if np.all(np.isfinite(bar))]
         elif isinstance(part, Dots):
             content["lines"].append({"name": "", "colour": FAINT, "width": 0, "x": packed(part.x), "y": packed(part.y)})

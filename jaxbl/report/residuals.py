@@ -17,6 +17,7 @@ from .panels import (
     FAINT,
     MISSING,
     SIDE_COLOURS,
+    TIME,
     ZERO,
     Axis,
     Band,
@@ -78,7 +79,7 @@ def _over_time(
             for part in estimates:
                 drawn += torque_parts(part.residual, bandwidth, label, noise=False, width=0.5)
         title = fill(sentence_of(located[name], unit), _WIDTH)
-        panels.append(Panel(Axis("time (s)"), Axis(missing_label(f"{name}:\n", unit)), [ZERO, *drawn], title))
+        panels.append(Panel(TIME, Axis(missing_label(f"{name}:\n", unit)), [ZERO, *drawn], title))
     caption = (
         "Torque that the model lacks (inertia times acceleration less all modelled torques, positive forward), after the "
         "low-pass that shows it most clearly. The grey band is twice the standard deviation of the noise."

@@ -51,23 +51,19 @@ class _Kind(NamedTuple):
         describe: says what was found.
         draw: draws the figures; the first is the one beside the answer.
         write: writes the files beside the page into a folder, and returns the study or model that the page shows, as TOML.
-        subject: what the result is about.
         file: what was found, as data; names the result in the manifest of its folder.
+        subject: what the result is about.
     """
 
     describe: Callable[[Any], Result]
     draw: Callable[[Any], list[Figure]]
     write: Callable[[Any, Path], str]
-    subject: Callable[[Any], Subject]
     file: str = PAGE
+    subject: Callable[[Any], Subject] = lambda result: study_subject(result.config)
 
 
 def _of_summary(describe: Callable[[Any], Result]) -> Callable[[Any], Result]:
     return lambda found: describe(found.summary)
-
-
-def _study(result: Any) -> Subject:
-    return study_subject(result.config)
 
 
 def _log(result: Any) -> Subject:
@@ -75,27 +71,27 @@ def _log(result: Any) -> Subject:
 
 
 _KINDS = {
-    Trial: _Kind(describe_trial, draw_trial, write_trial, _study, "summary.json"),
-    StudyResult: _Kind(describe_sweep, draw_study, write_sweep, _study),
-    Tuning: _Kind(describe_tuning, draw_tuning, write_tuning, _study, "tuning.json"),
-    ObserverChoice: _Kind(describe_choice, draw_choice, write_choice, _study, "tuning.json"),
-    Verdict: _Kind(describe_verdict, draw_verdict, write_verdict, _study),
+    Trial: _Kind(describe_trial, draw_trial, write_trial, "summary.json"),
+    StudyResult: _Kind(describe_sweep, draw_study, write_sweep),
+    Tuning: _Kind(describe_tuning, draw_tuning, write_tuning, "tuning.json"),
+    ObserverChoice: _Kind(describe_choice, draw_choice, write_choice, "tuning.json"),
+    Verdict: _Kind(describe_verdict, draw_verdict, write_verdict),
     Comparison: _Kind(
-        describe_comparison, draw_comparison, write_comparison, lambda _: Subject("comparison"), "comparison.json"
+        describe_comparison, draw_comparison, write_comparison, "comparison.json", lambda _: Subject("comparison")
     ),
     Inspection: _Kind(
         describe_inspection,
         draw_inspection,
         write_inspection,
-        lambda inspection: log_subject(inspection.record.path),
         "inspection.json",
+        lambda found: log_subject(found.record.path),
     ),
     Identification: _Kind(
-        _of_summary(describe_identification), draw_identification, write_identification, _log, "identification.json"
+        _of_summary(describe_identification), draw_identification, write_identification, "identification.json", _log
     ),
-    ElementIdentification: _Kind(_of_summary(describe_element), draw_element, write_element, _log, "identification.json"),
-    Diagnosis: _Kind(_of_summary(describe_diagnosis), draw_diagnosis, write_diagnosis, _log, "diagnosis.json"),
-    Watch: _Kind(describe_watch, draw_watch, write_watch, lambda watch: log_subject(Path(watch.task.name)), "watch.json"),
+    ElementIdentification: _Kind(_of_summary(describe_element), draw_element, write_element, "identification.json", _log),
+    Diagnosis: _Kind(_of_summary(describe_diagnosis), draw_diagnosis, write_diagnosis, "diagnosis.json", _log),
+    Watch: _Kind(describe_watch, draw_watch, write_watch, "watch.json", lambda watch: log_subject(Path(watch.task.name))),
 }
 
 

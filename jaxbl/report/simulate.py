@@ -18,6 +18,7 @@ from .panels import (
     BLUE,
     SIDE_COLOURS,
     SIDES,
+    TIME,
     VERMILION,
     ZERO,
     Axis,
@@ -29,8 +30,6 @@ from .panels import (
     stack,
     with_unit,
 )
-
-_TIME = Axis("time (s)")
 
 
 def write_trial(trial: Trial, folder: Path) -> str:
@@ -95,7 +94,7 @@ def draw_trial(trial: Trial) -> list[Figure]:
     sides = [side for side in SIDES if f"{side}.position" in trace]
     figures = [_torque(trace, sides)]
     figures += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
-    panel = Panel(_TIME, Axis("input torque u (N m)"), [Line(trace["t"], trace["u"])])
+    panel = Panel(TIME, Axis("input torque u (N m)"), [Line(trace["t"], trace["u"])])
     figures.append(Figure("input", [panel], "Input torque (analogue of Fig. 7).", height=2.4))
     if trial.config.controller is not None:
         figures.append(_draw_following(trace, trial.config.controller.side))
@@ -117,8 +116,8 @@ def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Figure:
     time, true, estimate = (trace[column] for column in ("t", name, f"{name}_estimate"))
     lines = [Line(time, estimate, "observer", VERMILION, 2.4, opacity=0.8), Line(time, true, "true", width=1.0)]
     panels = [
-        Panel(_TIME, Axis(f"{side} {quantity} ({unit})"), lines),
-        Panel(_TIME, Axis(f"error ({unit})"), [ZERO, Line(time, true - estimate, colour=BLUE)]),
+        Panel(TIME, Axis(f"{side} {quantity} ({unit})"), lines),
+        Panel(TIME, Axis(f"error ({unit})"), [ZERO, Line(time, true - estimate, colour=BLUE)]),
     ]
     caption = f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of Figs. {_FIGURES[name]})."
     return stack(f"{side}_{quantity}", panels, caption)
@@ -143,8 +142,8 @@ def _torque(trace: DataFrame, sides: list[str]) -> Figure:
     below = [line._replace(y=torque - line.y, name="", width=1.0) for line in above]
     name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
     panels = [
-        Panel(_TIME, Axis(f"{name} (N m)"), [*above, Line(time, torque, "true", width=1.0)]),
-        Panel(_TIME, Axis("error (N m)"), [ZERO, *below]),
+        Panel(TIME, Axis(f"{name} (N m)"), [*above, Line(time, torque, "true", width=1.0)]),
+        Panel(TIME, Axis("error (N m)"), [ZERO, *below]),
     ]
     return stack("torque", panels, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
 
@@ -160,7 +159,7 @@ def _draw_identified(trial: Trial, last: DataFrame) -> Figure:
         largest = float((last[[f"{side}.{name}" for side in SIDES]] - true).abs().max(axis=None))
         reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
         axis = Axis(with_unit(name.replace("_", " "), units.get(name, "rad")), ends=(true - reach, true + reach))
-        panels.append(Panel(_TIME, axis, [*lines, Span(true, true, "true", along="y")]))
+        panels.append(Panel(TIME, axis, [*lines, Span(true, true, "true", along="y")]))
     return stack("dead_zone", panels, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
 
 

@@ -39,6 +39,8 @@ from .panels import (
     Span,
     literal,
     mark,
+    name_rows,
+    place_words,
     stretches,
     with_unit,
 )
@@ -224,7 +226,7 @@ def _spans_decade(values: Array) -> bool:
 def _comparison(summary: JsonObject, sides: list[str]) -> Figure:
     rows, metric = summary["holdout"]["rows"], f"{summary['objective']}_rmse"
     names = list(dict.fromkeys(row["name"] for row in rows))
-    y = Axis(ends=(len(names) - 0.5, -0.5), names=tuple(enumerate(map(literal, names))))
+    y = name_rows([*map(literal, names)])
     compared = ((metric, f"worst {error_label(summary)}"), ("convergence_time", "worst convergence time (s)"))
     panels = [
         _bars(key, label, y, side * (key == metric), [row for row in rows if row["side"] == side])
@@ -258,7 +260,7 @@ def _bars(key: str, label: str, y: Axis, title: str, rows: list[JsonObject]) -> 
     parts.append(Line(medians, [i for i, *_ in finite_rows], width=0.0, marker="|", size=12.0))
     lost = [(i, row) for i, row in enumerate(rows) if row[key]["worst"] is None]
     texts = [f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged" for _, row in lost]
-    parts.append(Line([low] * len(lost), [i for i, _ in lost], width=0.0, marker=" ", texts=texts))
+    parts.append(place_words([low] * len(lost), [i for i, _ in lost], texts))
     return Panel(Axis(label, log=log, ends=(low, high)), y, parts, title)
 
 

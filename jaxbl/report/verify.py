@@ -132,7 +132,8 @@ def describe_verdict(verdict: Verdict) -> Result:
     """Say whether the marked gains are safe, and which conditions are wrong."""
     marks, levels = verdict.summary["marks"], verdict.summary["levels"]
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
-    failures = sum(entry["counterexamples"] for level in levels for entry in level["conditions"] if entry["name"] == "exact")
+    exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
+    failures = sum(entry["counterexamples"] for _, entry in exact)
     extent = (
         f"{levels[0]['cells']} cells of the error system and {sum(level['cells'] for level in levels[1:])} runs of the drive"
     )
@@ -151,12 +152,10 @@ def describe_verdict(verdict: Verdict) -> Result:
         for gains in marks[:4]
         if gains["margin_exact"]
     ]
-    if not figures:
-        counted = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
-        figures = [
-            KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the condition held")
-            for level, entry in counted[:4]
-        ]
+    figures = figures or [
+        KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the condition held")
+        for level, entry in exact[:4]
+    ]
     tables = [_level_table(level) for level in levels]
     tables += [table for level in levels for table in _claimed_tables(level)]
     if marks:

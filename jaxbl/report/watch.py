@@ -20,7 +20,7 @@ from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Pa
 
 VALUES = "watch.csv"
 SUMMARY = "watch.json"
-_LABELS = {
+LABELS = {
     "half_gap": "half gap", "stiffness": "stiffness", "coulomb": "Coulomb friction", "viscous": "viscous friction",
 }  # fmt: skip
 
@@ -62,14 +62,14 @@ def describe_watch(watch: Watch) -> Result:
     rows = [
         [f"{side}: {label}", *(values.get(f"{side}.{name}{kind}") for values in ends for kind in ("", "_error")),
          task.units[side][name]]
-        for side, (name, label) in product(SIDES, _LABELS.items())
+        for side, (name, label) in product(SIDES, LABELS.items())
         if f"{side}.{name}" in watch.values
     ]  # fmt: skip
     columns = ["number", "first value", "standard error", "last value", "standard error", "unit"]
     figures = [
         KeyFigure(
             f"{end[name]:.4g} {units[name]}",
-            f"{_LABELS[name]} at {end['t']:.1f} s (95 %: {end[f'{name}_from']:.4g} to {end[f'{name}_to']:.4g})",
+            f"{LABELS[name]} at {end['t']:.1f} s (95 %: {end[f'{name}_from']:.4g} to {end[f'{name}_to']:.4g})",
         )
         for name in ("half_gap", "stiffness")
         if last is not None and name in last
@@ -137,11 +137,11 @@ def draw_watch(watch: Watch) -> list[Figure]:
             sure = error <= 3.0 * np.nanmedian(error) if np.isfinite(error).any() else np.isfinite(error)
             curves += [middle[sure], low[sure], high[sure]]
         lead = f"{sides[0]} " if len(sides) == 1 else ""
-        y = Axis(f"{_LABELS[name]}\n{lead}({task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))
+        y = Axis(f"{LABELS[name]}\n{lead}({task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))
         panels.append(Panel(x, y, parts))
     caption = f"Numbers of the last {task.window:g} s by both observers, with 95 % intervals."
     if limit is not None:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
     # gap and stiffness are seen at once, friction below
-    parted = {"watch": panels[: len(law)], "watch_friction": panels[len(law) :]} if law else {"watch": panels}
-    return [stack(name, part, caption, 1.5) for name, part in parted.items()]
+    parted = {"watch": panels[: len(law)], "watch_friction": panels[len(law) :]}
+    return [stack(name, part, caption, 1.5) for name, part in parted.items() if part]

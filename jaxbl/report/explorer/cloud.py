@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxbl.report.checks import has_words
-from jaxbl.report.maps import axis_label, unit_of
+from jaxbl.report.maps import axis_words
 from jaxbl.sweeps.sweep import StudyResult
 
 from .folder import page_values, points_writer
@@ -31,14 +31,7 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> dict[str,
             write(frame.assign(**places, **metric_values))
             rows += len(frame)
     descriptions = [
-        {
-            "path": axis.path,
-            "label": axis_label(config, axis.path),
-            "unit": unit_of(config, axis.path),
-            "words": words.get(axis.path),
-            "log": axis.scale == "log",
-        }
-        for axis in config.axes
+        axis_words(config, axis.path) | {"words": words.get(axis.path), "log": axis.scale == "log"} for axis in config.axes
     ]
     sampled = config.sweep.design != "grid"
     return {"axes": descriptions, "rows": rows, "found": rows, "total": result.runs, "sampled": sampled}

@@ -59,9 +59,9 @@ class Source(NamedTuple):
     identity: str
     lead: Sequence[str]
     write: Callable[[Path, bool], bool]
-    answers: Mapping[str, Callable[[Any], Mapping[str, Any]]]
-    prepare: Callable[[], Any]
-    finish: Callable[[], Any]
+    answers: Mapping[str, Callable[[Any], Mapping[str, Any]]] = {}
+    prepare: Callable[[], Any] = lambda: None
+    finish: Callable[[], Any] = lambda: None
 
 
 def write_static(source: Source, out: Path) -> Path:

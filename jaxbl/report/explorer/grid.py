@@ -16,7 +16,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.gain_plane import least_lambdas
-from jaxbl.report.maps import axis_label, best_gains, unit_of, worst_runs
+from jaxbl.report.maps import axis_words, best_gains, worst_runs
 from jaxbl.report.panels import packed
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -64,17 +64,7 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -
     dims = dimensions(result.config)
     assert dims is not None
     axes = [
-        {
-            "paths": [
-                {
-                    "path": path,
-                    "label": path if path == "seed" else axis_label(result.config, path),
-                    "unit": unit_of(result.config, path),
-                    "values": to_jsonable(values),
-                }
-                for path, values in dim.items()
-            ]
-        }
+        {"paths": [axis_words(result.config, path) | {"values": to_jsonable(values)} for path, values in dim.items()]}
         for dim in dims
     ]
     written = _write_points(result, metrics, first, out, dims)

@@ -13,6 +13,7 @@ from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.panels import missing_quantity
+from jaxbl.report.watch import LABELS
 
 from .folder import Source, colours_of, points_writer, write_page
 
@@ -39,7 +40,7 @@ def log_source(file: Path, title: str, sentences: Sequence[str]) -> Source:
         return False
 
     identity = str(summary.get("identity") or checksum(file.read_bytes()))
-    return Source(identity, sentences, write, {}, lambda: None, lambda: None)
+    return Source(identity, sentences, write)
 
 
 def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
@@ -94,12 +95,9 @@ def _errors(trace: DataFrame) -> dict[str, np.ndarray]:
     return {name: trace[true].to_numpy() - trace[estimate].to_numpy() for name, (true, estimate) in columns.items()}
 
 
-_WATCHED = {"half_gap": "half gap", "stiffness": "stiffness", "coulomb": "Coulomb friction", "viscous": "viscous friction"}
-
-
 def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
     """The figures of a watch: each number by both observers."""
-    for name, label in _WATCHED.items():
+    for name, label in LABELS.items():
         columns = {f"{side}.{name}": f"by the {side} observer" for side in POSITION_CHANNELS}
         columns |= {f"{name}_{end}": f"{end}, with 95 %" for end in ("from", "to")}
         lines = [{"column": column, "label": f"{label} {origin}"} for column, origin in columns.items() if column in frame]
@@ -197,10 +195,7 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
     name = "torque in the transmission" if {"transmitted", "torque"} & {*frame} else "disturbance torque"
     yield group(name, missing_quantity(force), force, lines)
     for side, unit in units.items():
-        lines = {
-            f"{side}.velocity": speed,
-            f"{side}.velocity_estimate": "by the observer",
-        }
+        lines = {f"{side}.velocity": speed, f"{side}.velocity_estimate": "by the observer"}
         if f"{side}.velocity_estimate" in frame:
             yield group(f"{side}: speed", "speed", f"{unit}/s", lines)
 

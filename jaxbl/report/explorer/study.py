@@ -76,7 +76,7 @@ def comparison_source(file: Path, _: str, sentences: Sequence[str]) -> Source:
         )
         return write_study(StudyResult(config, frame), out, sentences, studies=names)
 
-    return Source(checksum(file.read_bytes()), sentences, write, {}, lambda: None, lambda: None)
+    return Source(checksum(file.read_bytes()), sentences, write)
 
 
 def _lead(result: StudyResult) -> list[str]:
