@@ -5,9 +5,6 @@
 const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
 const GREY = "#8a8d93";
 
-/** Names and colours of lines. */
-const legend = (entries) => made("p", { className: "legend" }, ...entries.map(([name, colour, dashed]) => made("span", {}, markOf(colour, dashed), name)));
-
 /** Least and largest of numbers that are finite, and above 0 where that is asked for. */
 const endsOf = (columns, log = false) => {
   let [low, high] = [Infinity, -Infinity];
@@ -73,7 +70,7 @@ class Chart {
     this.view.setAttribute("role", "application");
     // uPlot sizes itself later
     this.view.style.height = `${this.height}px`;
-    this.key = made("div");
+    this.key = made("p", { className: "legend" });
     element.replaceChildren(...(title ? [made("p", { className: "over", textContent: title })] : []), this.key, this.view, ...(caption ? [made("figcaption", { textContent: caption })] : []));
     this.listen();
     new ResizeObserver(() => { if (this.plot?.width !== this.view.clientWidth) this.build(); }).observe(this.view);
@@ -82,8 +79,9 @@ class Chart {
   set(lines, shades = []) {
     this.lines = lines.filter((one) => one.x.length);
     this.shades = shades;
-    const entries = [...this.lines, ...shades.map((one) => ({ colour: GREY, ...one }))].filter((one) => one.name).map((one) => [one.name, one.colour ?? "currentColor", one.dash?.length]);
-    this.key.replaceChildren(...(this.named ? [legend([...new Map(entries.map((one) => [one[0], one])).values()])] : []));
+    const named = [...this.lines, ...shades.map((one) => ({ colour: GREY, ...one }))].filter((one) => this.named && one.name);
+    const entries = new Map(named.map(({ name, colour, dash }) => [name, made("span", {}, markOf(colour ?? "currentColor", dash?.length), name)]));
+    this.key.replaceChildren(...entries.values());
     this.build();
   }
   /** Ends of both axes of what is shown. */

@@ -61,7 +61,7 @@ def tabulate_points(comparison: Comparison) -> pd.DataFrame:
             frame = comparison.frame(change.metric)
             columns |= {path: frame[path] for path in comparison.axes}
             numbers = frame[["first", "second"]].astype(float)
-            numbers["factor"] = _divide(numbers, change.metric)
+            numbers.insert(0, "factor", _divide(numbers, change.metric))
             columns |= {f"{change.metric}.{name}": column for name, column in numbers.items()}
     return pd.DataFrame(columns)
 

@@ -37,8 +37,7 @@ class Runs {
     $("point").disabled = true;
     const began = performance.now();
     const answered = async (what) => {
-      const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) });
-      const found = await answer.json();
+      const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ values, seed }) }), found = await answer.json();
       if (!answer.ok) throw new Error(found.error);
       return found;
     };
@@ -46,14 +45,9 @@ class Runs {
     // one is computed at a time: of clicks meanwhile the last one counts
     await this.waiting?.catch(() => null);
     if (asked !== this.asked) return;
-    let found;
-    try {
-      found = await ask("simulated");
-    } catch (error) {
-      if (asked === this.asked) $("told").textContent = `Not simulated: ${error.message}`;
-      return;
-    }
+    const found = await ask("simulated").catch((error) => ({ error: error.message }));
     if (asked !== this.asked) return;
+    if (found.error) { $("told").textContent = `Not simulated: ${found.error}`; return; }
     this.all = this.all.filter((one) => one.pinned && one.row !== row);
     if (this.all.length === COLOURS.length) this.all.shift();
     const columns = Object.fromEntries(Object.entries(found.columns).map(([name, bytes]) => [name, unpacked(bytes)]));
@@ -108,13 +102,13 @@ class Runs {
       })));
     }
     for (const side of SIDES.filter((one) => newest.planes[one] && !apart)) {
-      const planes = this.all.map((run) => run.planes[side]).filter(Boolean), bounded = planes.some(({ majorant }) => majorant);
-      const [x, y] = [0, 1].map((i) => Math.max(...planes.map(({ reach }) => reach[i]))).map((reach) => (reach > 0 ? [-reach, reach] : null));
-      const spec = { title: `${side}: error of the observer in the phase plane${bounded ? ", dashed: majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`,
-        x: { label: "position error e", unit: "rad", ends: x }, y: { name: "its slope ė", unit: "rad/s", ends: y } };
-      add(spec, [newest, ...others].filter((run) => run.planes[side]).flatMap((run) => {
-        const { error, slope, majorant } = run.planes[side], lines = [{ name: named(run, "error"), x: unpacked(error), y: unpacked(slope), colour: run.colour, width: run === newest ? 1.5 : 1 }];
-        return majorant ? [...lines, { name: named(run, "majorant"), x: unpacked(majorant[0]), y: unpacked(majorant[1]), colour: others.length ? run.colour : GREY, dash: [2, 3] }] : lines;
+      const drawn = [newest, ...others].filter((run) => run.planes[side]), bounded = drawn.some((run) => run.planes[side].majorant);
+      const [x, y] = [0, 1].map((i) => Math.max(...drawn.map((run) => run.planes[side].reach[i]))).map((reach) => (reach > 0 ? [-reach, reach] : null));
+      const title = `${side}: error of the observer in the phase plane${bounded ? ", dashed: majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`;
+      add({ title, x: { label: "position error e", unit: "rad", ends: x }, y: { name: "its slope ė", unit: "rad/s", ends: y } }, drawn.flatMap((run) => {
+        const { error, slope, majorant } = run.planes[side], line = (name, along, up, look) => ({ name: named(run, name), x: unpacked(along), y: unpacked(up), colour: run.colour, ...look });
+        const lines = [line("error", error, slope, { width: run === newest ? 1.5 : 1 })];
+        return majorant ? [...lines, line("majorant", ...majorant, { dash: [2, 3], ...(others.length ? {} : { colour: GREY }) })] : lines;
       }));
     }
     // their widths are known when all are there

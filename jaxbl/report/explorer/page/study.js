@@ -94,9 +94,7 @@ const dimension = ({ paths }, i) => {
 /** One number of several, nan left out. */
 const reduced = {
   median: (values) => {
-    if (!values.length) return NaN;
-    values.sort();
-    const middle = values.length >> 1;
+    const middle = values.sort().length >> 1;
     return values.length % 2 ? values[middle] : 0.5 * (values[middle - 1] + values[middle]);
   },
   mean: (values) => (values.length ? values.reduce((a, b) => a + b, 0) / values.length : NaN),
@@ -141,6 +139,7 @@ const mapped = (study, column, view, mask = null) => {
 
 /** A value as TOML: a whole number stands for a real one, too. */
 const exact = (value) => (typeof value === "number" ? String(value) : JSON.stringify(value));
+const assigned = (table) => Object.entries(table).map(([key, value]) => `${key} = ${exact(value)}`);
 /** A point, its values by path, as a study that includes this one; it has all of its `effects` if one of them is varied. */
 const pointText = (values, effects) => {
   const lines = ['include = "study.toml"', "axes = []", "figures = []", "notes = []"], tables = effects.map((one) => ({ ...one }));
@@ -152,15 +151,13 @@ const pointText = (values, effects) => {
     else lines.push(`${path} = ${exact(value)}`);
     varied ||= Boolean(name);
   }
-  for (const one of varied ? tables : []) lines.push("", "[[effects]]", ...Object.entries(one).map(([key, value]) => `${key} = ${exact(value)}`));
+  for (const one of varied ? tables : []) lines.push("", "[[effects]]", ...assigned(one));
   return `${lines.join("\n")}\n`;
 };
 
 /** Gains of a point, for a study to include. */
 const gainsText = (gains, values) => {
-  const tables = Object.entries(gains).map(([side, own]) => {
-    const [lambda, alpha] = ["lambda", "alpha"].map((name) => exact(values[`observer.${side}.${name}`] ?? own[name]));
-    return `[observer.${side}]\nlambda = ${lambda}\nalpha = ${alpha}\n`;
-  });
-  return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n${tables.join("\n")}`;
+  const chosen = (side, own) => Object.fromEntries(["lambda", "alpha"].map((name) => [name, values[`observer.${side}.${name}`] ?? own[name]]));
+  const tables = Object.entries(gains).map(([side, own]) => ["", `[observer.${side}]`, ...assigned(chosen(side, own)), ""].join("\n"));
+  return `# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n${tables.join("")}`;
 };
