@@ -46,7 +46,7 @@ def test_reference_is_generated_from_this_code():
 
 
 def test_pictures_are_what_is_drawn_today():
-    """Each picture was drawn anew since its studies, programs and the drawing of panels changed."""
+    """Each picture was drawn anew since what it is made of changed: studies, programs, and what draws panels in minutes."""
     inputs = load_script("picture_inputs")
     table = inputs.read_table()
     assert set(table) == {file.stem for file in inputs.FIGURES.glob("*.png")}
