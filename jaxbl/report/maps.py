@@ -328,7 +328,7 @@ def _map_panels(
             table=part["table"],
             finite=part["finite"],
             converged=part.get(f"{side}.converged"),
-            best=(best := errors and best_gains(errors[value])) and errors[value].index[best.index],
+            best=errors and (best := best_gains(errors[value])) and errors[value].index[best.index],
             bound=None if bounds is None else float(bounds.iloc[i]),
             dots=dots and dots[value],
         )

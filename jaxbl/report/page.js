@@ -47,7 +47,7 @@ const charts = [];
 /** A panel of lines as a chart, and what the panel's lines say. */
 const charted = (element, { x, y, title, lines, shades }, height) => {
   // a label that is longer than its axis stands above it
-  const above = 6.4 * y.label.length > height - 38, over = above ? { title: [title, y.label].filter(Boolean).join(": "), y: { ...y, name: y.label, label: "" } } : { title, y };
+  const above = 6.4 * y.label.length > height - 38, over = above ? { title: [title, y.label].filter(Boolean).join(": "), y: { ...y, name: y.label, label: " " } } : { title, y };
   const chart = new Chart(element, { x, height, named: true, group: charts, ...over });
   // of a line with marks the marks are dots of their own
   const dotted = lines.filter((line) => line.marker).map((line) => ({ ...line, dots: line.marker === "." ? 4 : 6 }));

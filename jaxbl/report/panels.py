@@ -391,8 +391,8 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         elif isinstance(part, Span):
             content["spans"].append(part._asdict())
         elif isinstance(part, Bars):
-            ends = zip(part.places, part.lengths, strict=True)
-            corners = [(0.0, place - part.thickness / 2.0, length, part.thickness) for place, length in ends]
+            bars = zip(part.places, part.lengths, strict=True)
+            corners = [(0.0, place - part.thickness / 2.0, length, part.thickness) for place, length in bars]
             content["bars"] += [[float(f"{number:.6g}") for number in bar] for bar in corners if np.all(np.isfinite(bar))]
         elif isinstance(part, Dots):
             content["lines"].append({"name": "", "colour": FAINT, "width": 0, "x": packed(part.x), "y": packed(part.y)})
