@@ -39,7 +39,7 @@ const unpack = ({ x, y, lines, cells, bands, spans, ...panel }) => ({
   ...panel, ...Object.fromEntries([["x", x], ["y", y]].map(([name, { names, ...axis }]) => [name, { ...axis, names: names && new Map(names) }])),
   lines: lines.map((line) => ({ ...line, x: unpacked(line.x), y: unpacked(line.y), colour: black(line.colour), alpha: line.opacity, dash: DASHES[line.dashes] })),
   cells: cells && { name: cells.name, edges: [unpacked(cells.x), unpacked(cells.y)], values: unpacked(cells.values) },
-  shades: [...bands.map((band) => ({ ...band, x: unpacked(band.x), low: unpacked(band.low), high: unpacked(band.high) })), ...spans.map((span) => ({ ...span, colour: black(span.colour) ?? GREY }))].map((one) => ({ ...one, alpha: one.opacity })),
+  shades: [...bands.map((band) => ({ ...band, x: unpacked(band.x), low: unpacked(band.low), high: unpacked(band.high) })), ...spans.map((span) => ({ ...span, colour: black(span.colour) ?? GREY }))].map((one) => ({ ...one, alpha: one.low === one.high ? 1 : one.opacity })),
 });
 
 const charts = [];

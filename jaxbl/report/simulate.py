@@ -127,8 +127,8 @@ def _draw_following(trace: DataFrame, side: str) -> Figure:
     time, target, true = trace["t"], trace["reference"], trace[f"{side}.position"]
     lines = [Line(time, target, "reference", VERMILION, 2.4, opacity=0.8), Line(time, true, "true", width=1.0)]
     panels = [
-        Panel(_TIME, Axis(f"{side} position (rad)"), lines),
-        Panel(_TIME, Axis("following error (rad)"), [ZERO, Line(time, target - true, colour=BLUE)]),
+        Panel(TIME, Axis(f"{side} position (rad)"), lines),
+        Panel(TIME, Axis("following error (rad)"), [ZERO, Line(time, target - true, colour=BLUE)]),
     ]
     return stack("following", panels, f"{side.capitalize()} position, the reference that it is to follow, and the error.")
 
