@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -73,35 +73,6 @@ class Rows(NamedTuple):
     torque: np.ndarray
     positions: dict[str, np.ndarray]
     starts_segment: bool
-
-
-class Source(Protocol):
-    """A source of rows.
-
-    Attributes:
-        name: for messages.
-        counts: fault -> number of rows, lines or datagrams that were left out.
-        fault: end of a sentence on the last line or datagram that could not be read; "" if there is none.
-    """
-
-    name: str
-    counts: Counter[str]
-    fault: str
-
-    def poll(self, seconds: float) -> Block | None:
-        """Wait at most `seconds` for rows.
-
-        Returns:
-            Names of the columns, and numbers (rows, columns), NaN for a cell without one; None if nothing has come.
-
-        Raises:
-            InputError: no row can be used.
-        """
-        ...
-
-    def close(self) -> None:
-        """Release the file or the address."""
-        ...
 
 
 def _stream_channels(table: LogTable) -> dict[str, TimeTable | TorqueTable | PositionTable | SpeedTable]:
@@ -231,16 +202,14 @@ class Stream:
         period: expected sampling period, s.
     """
 
-    def __init__(self, source: Source, table: LogTable, period: float):
+    def __init__(self, source: "Source", table: LogTable, period: float):
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
         self._reader: _ChannelReader | None = None
         self._columns: Sequence[ColumnName] = ()
         self._block: Block | None = None
-        self._recent, self._held = np.empty((4, 0)), np.empty((4, 0))
-        self._last = np.empty((4, 0))
-        self._first_stamps: list[float] = []
         self._is_period_right: bool | None = None
+        self._begin_anew()
 
     def poll(self, seconds: float) -> list[Rows]:
         """Return the rows that arrive within `seconds`.
@@ -283,7 +252,7 @@ class Stream:
     def _begin_anew(self) -> None:
         """Forget what was before: another sender may have another clock, period and zero."""
         self._recent = self._held = self._last = np.empty((4, 0))
-        self._first_stamps = []
+        self._first_stamps: list[float] = []
 
     def _count(self, fault: str, number: int) -> None:
         if number:
@@ -395,12 +364,17 @@ def period_error(name: str, measured: float, period: float) -> InputError:
     )
 
 
-class _TextSource:
-    """Rows of text in the format of the first ones, or of a later header; attributes are those of a :class:`Source`.
+class Source:
+    """A source of rows of text, in the format of the first ones or of a later header.
 
     Args:
         name: for messages.
         fields: columns that are needed.
+
+    Attributes:
+        name: for messages.
+        counts: fault -> number of rows, lines or datagrams that were left out.
+        fault: end of a sentence on the last line or datagram that could not be read; "" if there is none.
     """
 
     def __init__(self, name: str, fields: Sequence[ColumnName]):
@@ -408,6 +382,20 @@ class _TextSource:
         self._fields = list(fields)
         self._format: TextFormat | None = None
         self._header = ""
+
+    def poll(self, seconds: float) -> Block | None:
+        """Wait at most `seconds` for rows.
+
+        Returns:
+            Names of the columns, and numbers (rows, columns), NaN for a cell without one; None if nothing has come.
+
+        Raises:
+            InputError: no row can be used.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Release the file or the address."""
 
     def _parse_lines(self, text_format: TextFormat, lines: deque[str]) -> np.ndarray:
         """Take lines, as far as they have one format, and parse them into numbers, shape (rows, columns).
@@ -446,7 +434,7 @@ class _TextSource:
         return False
 
 
-class FollowedFile(_TextSource):
+class FollowedFile(Source):
     """Rows of a text file, from its beginning on, and those that are written to it later.
 
     Args:
@@ -547,7 +535,7 @@ class FollowedFile(_TextSource):
         self._file.close()
 
 
-class Datagrams(_TextSource):
+class Datagrams(Source):
     """Rows in UDP datagrams: lines of text, or binary numbers (float64, little-endian), one row after the other.
 
     Args:
