@@ -94,7 +94,7 @@ class Cluster:
 
         waiting, begun = iter(jobs), {}
         finished = as_completed(loop=self._client.loop)
-        most, counted, seen = 0, -_COUNT_SECONDS, time.monotonic()
+        most, counted, last_worker = 0, -_COUNT_SECONDS, time.monotonic()
         try:
             while True:
                 if self._client.status != "running":
@@ -102,8 +102,8 @@ class Cluster:
                 if time.monotonic() - counted > _COUNT_SECONDS:
                     most, counted = max(_AHEAD * self.workers, _FEWEST_AHEAD), time.monotonic()
                 if self._client.nthreads():
-                    seen = time.monotonic()
-                elif time.monotonic() - seen > _WORKERS_SECONDS:
+                    last_worker = time.monotonic()
+                elif time.monotonic() - last_worker > _WORKERS_SECONDS:
                     raise NoResult(f"no worker has come for {format_duration(_WORKERS_SECONDS)}; {_KEPT}")
                 else:
                     announce("waiting for workers: the scheduler has none")

@@ -44,7 +44,7 @@ class StudyNumber(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """What a position is counted from where numbers are too short for many turns.
+    """A reference that a position is counted from, where numbers are too short for many turns.
 
     Attributes:
         inputs: names of the inputs that are counted from it; the first one's estimate is the output `{input}_estimate`.

@@ -187,7 +187,7 @@ class _C(Writer):
 
     def _move_references(self, routine: Routine, references: Sequence[Reference], states: Collection[str]) -> None:
         """Write how references follow the first position, with the `states` that are positions, and what is left."""
-        first, away, whole = references[0], self.make_unique("away"), self.make_unique("whole")
+        first, away, steps = references[0], self.make_unique("away"), self.make_unique("steps")
         self.needs_math = True
         if not states:
             self.add_lines(*(f"state->{origin.name} = 0.0;" for origin in references))
@@ -195,12 +195,12 @@ class _C(Writer):
             f"const double {away} = ({first.inputs[0]} - state->{first.name}) / {first.step!r};",
             f"if ((fabs({away}) >= 1.0) && (fabs({away}) < 2147483648.0))",
             "{",
-            f"    const double {whole} = (double)(int32_t){away};",
+            f"    const double {steps} = (double)(int32_t){away};",
         )
         for origin in references:
-            self.add_lines(f"    state->{origin.name} += {whole} * {origin.step!r};")
+            self.add_lines(f"    state->{origin.name} += {steps} * {origin.step!r};")
             for place in (f"state->{state}" for state in states if state in origin.states):
-                self.add_lines(f"    {place} = (float)((double){place} - ({whole} * {origin.step!r}));")
+                self.add_lines(f"    {place} = (float)((double){place} - ({steps} * {origin.step!r}));")
         self.add_lines("}")
         names = {name: origin.name for origin in references for name in origin.inputs}
         for variable in drop_unread(routine)[1]:

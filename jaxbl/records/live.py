@@ -263,9 +263,9 @@ class Stream:
 
         A row at the end that is far from the one before is held until the next one has come.
         """
-        known = self._recent.shape[1]
+        recent = self._recent.shape[1]
         samples, self._held = np.concatenate([self._recent, self._held, samples], axis=1), samples[:, :0]
-        is_new = np.arange(samples.shape[1]) >= known
+        is_new = np.arange(samples.shape[1]) >= recent
         if samples.shape[1] > 2:
             steps = reader.steps(samples)
             sizes = np.abs(steps)

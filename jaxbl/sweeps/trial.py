@@ -62,12 +62,12 @@ def run(study: ConfigSource, *, seed: int = 0, every: int = 1, backend: Backend 
     config = read_config(study)
     if not 1 <= every <= config.run.steps:
         raise InputError(f"every: should be between 1 and the number of samples {config.run.steps}, not {every}")
-    samples = config.run.steps
+    rows = config.run.steps // every
     check_cost(
-        f"a trace of {samples // every} rows",
-        _ROW_BYTES * samples / every,
+        f"a trace of {rows} rows",
+        _ROW_BYTES * rows,
         "--every N keeps fewer of them",
-        _STEP_SECONDS * samples * config.run.substeps,
+        _STEP_SECONDS * config.run.steps * config.run.substeps,
     )
     with precision(config):
         experiment = prepare(config)
