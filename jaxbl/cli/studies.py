@@ -74,7 +74,8 @@ def simulate(
         results = claim_study(folder, study, "simulate", overwrite=overwrite)
         trial = jaxbl.run(study, seed=seed, every=every)
         card = jaxbl.describe(trial)
-        card = jaxbl.write_report(trial, results, replace(card, next_steps=after_run(card, config)))
+        # the terminal has no line left for it
+        jaxbl.write_report(trial, results, replace(card, next_steps=after_run(card, config)))
     return Outcome(card, folder, summary="summary.json", code=0 if trial.summary["metrics"]["finite"] else 1)
 
 
