@@ -31,11 +31,20 @@ from typer.main import get_command
 
 from jaxbl import cli, terminal
 from jaxbl.cli import setup
-from jaxbl.cli.next_steps import LogCall, after_diagnosis, after_identification
+from jaxbl.cli.next_steps import (
+    LogCall,
+    after_comparison,
+    after_diagnosis,
+    after_identification,
+    after_inspection,
+    after_run,
+    after_tuning,
+)
 from jaxbl.cli.options import folder_of
 from jaxbl.errors import InputError
 from jaxbl.files import lock_folder
-from jaxbl.lines import program_name
+from jaxbl.lines import NextStep, program_name
+from jaxbl.result import Result
 from jaxbl.sweeps.engine import Engine
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -1164,6 +1173,28 @@ def test_after_logs_what_is_open_by_what_was_found():
     nothing = {"findings": [], "verdict": "no_discrepancy"}
     assert diagnose_steps(**nothing) == ["jaxbl identify 'a b.csv' --model m.toml --out out_identified"]
     assert diagnose_steps(findings=[], verdict="unknown_effect") == []
+
+
+def test_after_runs_and_searches_what_to_do_with_the_gains():
+    good, failed, file, folder = Result("t", "good", "."), Result("t", "failed", "."), Path("a b.toml"), Path("out")
+    ((tune, _),) = after_run(good, file)
+    assert tune == "jaxbl tune 'a b.toml'" and after_run(failed, file) == [NextStep(tune, "Which gains converge?")]
+    assert [step.command for step in after_tuning(good, file, folder)] == [
+        "jaxbl simulate 'a b.toml' --gains out/gains.toml --out out_run",
+        "jaxbl export 'a b.toml' --gains out/gains.toml --out out_code",
+    ]
+    assert after_tuning(failed, file, folder) == []
+    assert [step.command for step in after_comparison(folder)] == ["jaxbl explore out"]
+
+
+def test_the_page_of_an_inspected_log_says_how_to_go_on(call):
+    simulate_log(count=6000, gap=0.1, noise=1e-4).to_csv("axis.csv", index=False)
+    assert call("inspect", "axis.csv")[0] == 0
+    ((command, _),) = after_inspection(Path("axis.csv"), None)
+    page = unescape(Path("results/axis_inspected/report.html").read_text(encoding="utf-8"))
+    assert command == "jaxbl inspect axis.csv --write axis.toml" and command in page
+    ((command, _),) = after_inspection(Path("axis.csv"), Path("m.toml"))
+    assert command == "jaxbl identify axis.csv --model m.toml"
 
 
 def test_commands_are_named_as_a_shell_finds_them(tmp_path, monkeypatch):

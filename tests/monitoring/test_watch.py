@@ -128,7 +128,7 @@ def test_a_law_without_a_gap_has_its_stiffness_watched(tmp_path):
     watch = jaxbl.watch(tmp_path / "log.csv", data, **WINDOW)
     assert watch.summary["last"]["stiffness"] == pytest.approx(60.0, rel=0.02)
     assert "half_gap" not in watch.values
-    assert [drawing.name for drawing in jaxbl.draw(watch)] == ["watch"]
+    assert [drawing.name for drawing in jaxbl.draw(watch)] == ["watch", "watch_friction"]
     with pytest.raises(InputError, match="law linear_shaft has no gap for --alarm-gap"):
         jaxbl.watch(tmp_path / "log.csv", data, alarm_gap=0.1, **WINDOW)
 
