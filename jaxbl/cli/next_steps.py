@@ -54,9 +54,8 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
 
 def after_run(card: "Result", config: Path) -> list[NextStep]:
     """Propose the command that chooses gains, after one run with those of the study."""
-    better = "Do other gains have less error, and what limits them?"
-    question = "Which gains converge?" if card.verdict == "failed" else better
-    return [_propose(question, "tune", config)]
+    gains = "converge" if card.verdict == "failed" else "have less error, and what limits them"
+    return [_propose(f"Which gains {gains}?", "tune", config)]
 
 
 def after_tuning(card: "Result", config: Path, folder: Path) -> list[NextStep]:

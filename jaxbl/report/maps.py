@@ -346,15 +346,15 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points | None)
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
 
     def medians(converged_alone: bool) -> Series:
-        def bounds(frame: DataFrame) -> Series:
+        def read(frame: DataFrame) -> Series:
             # most points of a refined study lie at its boundary: the median is that of the coarse grid
             there = frame[converged].astype(bool) | (not converged_alone)
             return frame[bound].where(there if points is None else there & points.on_coarse_grid(frame))
 
-        return groups.medians(Column([converged, bound, *paths], bounds))
+        return groups.medians(Column([converged, bound, *paths], read))
 
-    found = medians(True)
-    return found.fillna(medians(False)) if found.isna().any() else found
+    bounds = medians(True)
+    return bounds.fillna(medians(False)) if bounds.isna().any() else bounds
 
 
 def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> tuple[list[Panel], str]:
