@@ -54,6 +54,8 @@ _BACK = 4
 """Back from a fit beside it."""
 _CHOICES = 4
 """Of the predictor that suits the fit, at most."""
+_FINALISTS = 6
+"""Half gaps of which the fit goes on."""
 _PART = 4000
 """Samples that the first fits are made to."""
 _SETTLED = 0.01
@@ -520,7 +522,8 @@ class GapSearch:
         announce("trying half gaps")
         starts = self._starts()
         announce("fitting the gap")
-        fits = [self.coarse.solve(self.coarse.begin(point.theta, _FOLLOWING[-1]), _MORE) for _, point in starts]
+        likely = sorted((point for _, point in starts), key=lambda point: point.variance)[:_FINALISTS]
+        fits = [self.coarse.solve(self.coarse.begin(point.theta, _FOLLOWING[-1]), _MORE) for point in likely]
         best, spread = self.model.settle(self.model.fit([_likeliest(fits).theta]))
         announce("fitting without a gap")
         none = _NONE * self.travel
