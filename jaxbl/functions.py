@@ -8,7 +8,7 @@ own loop.
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -20,13 +20,20 @@ from jaxtyping import Array
 from jaxbl.chain import Experiment, NamedArrays, Sample, Signals, TracedArrays, replay, scan, unit_noise
 from jaxbl.config import ConfigSource, read_config
 from jaxbl.config.study import suggest_path
-from jaxbl.control import AbstractReference, FunctionReference
-from jaxbl.drive.excitation import AbstractExcitation, FunctionInput
+from jaxbl.control import CONTROLLERS, REFERENCES, AbstractController, AbstractReference, FunctionReference
+from jaxbl.drive.effects import EFFECTS, AbstractEffect
+from jaxbl.drive.excitation import EXCITATIONS, AbstractExcitation, FunctionInput
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
+from jaxbl.drive.transmission import TRANSMISSIONS, AbstractTransmission
 from jaxbl.errors import InputError
 from jaxbl.fused import warn_of_scan
+from jaxbl.observer import OBSERVERS, AbstractObserver
+from jaxbl.registry import Registry
 from jaxbl.sweeps.metrics import (
+    SIDE_METRICS,
+    Metric,
     add_gain_metrics,
+    clear_metrics,
     compute_gain_metrics,
     metric_columns,
     metrics_reducer,
@@ -66,6 +73,47 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
     if study.reference is not None and not isinstance(study.reference, AbstractReference):
         study = dataclasses.replace(study, reference=FunctionReference(study.reference))
     return as_arrays(study, dtype)
+
+
+_REGISTRIES: dict[type, Registry] = {
+    AbstractExcitation: EXCITATIONS,
+    AbstractTransmission: TRANSMISSIONS,
+    AbstractEffect: EFFECTS,
+    AbstractObserver: OBSERVERS,
+    AbstractController: CONTROLLERS,
+    AbstractReference: REFERENCES,
+    Metric: SIDE_METRICS,
+}
+"""Where a class of a base is registered."""
+_Part = TypeVar("_Part", bound=type)
+
+
+def register(part: _Part) -> _Part:
+    """Register a class of one's own under its `name`, for the studies of this process; a decorator.
+
+    Studies then take it as any other input, law, effect, observer, controller, reference or metric, at once and in the fused
+    loop. To define it again replaces it. Other processes need a package with an entry point (docs/effects.md).
+
+    Raises:
+        InputError: what is wrong with the class; a drive, which an :class:`Experiment` takes as it is.
+    """
+    cls: Any = part
+    for base, registry in _REGISTRIES.items():
+        if isinstance(cls, type) and issubclass(cls, base):
+            names = [f"{place}.{cls.kind}" for place in cls.places] if issubclass(cls, AbstractEffect) else [cls.name]
+            try:
+                for name in names:
+                    registry.register(name, cls)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"register: {cls.__name__}: {error}") from None
+            # traces of before do not know it
+            clear_metrics()
+            jax.clear_caches()
+            return part
+    raise InputError(
+        f"register: {part!r} should be a class of an input, law, effect, observer, controller, reference or metric; a drive "
+        "of one's own goes into jaxbl.Experiment as it is"
+    )
 
 
 def with_values(experiment: Experiment, values: Mapping[str, Any]) -> Experiment:

@@ -27,12 +27,25 @@ class Registry(Mapping[str, Any]):
         self.group = group
         self._check = check
         self._members: dict[str, Any] = {}
+        self._own: set[str] = set()
         self._loaded = False
 
     def add(self, cls: Class) -> Class:
         """Add a class of this package under its `name`; a decorator."""
         self._members[cls.name] = cls  # type: ignore[attr-defined]
         return cls
+
+    def register(self, name: str, cls: type) -> None:
+        """Add a class of this process, or put it in the place of an earlier one of this process.
+
+        Raises:
+            TypeError, ValueError: what is wrong with it, or the name is that of another part.
+        """
+        if name in self._load_all() and name not in self._own:
+            raise ValueError(f"the name '{name}' is taken")
+        self._check(name, cls)
+        self._own.add(name)
+        self._members[name] = cls
 
     def __getitem__(self, name: str) -> Any:
         return self._members[name] if name in self._members else self._load_all()[name]

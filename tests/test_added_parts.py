@@ -1,4 +1,5 @@
-"""A transmission law, an input and a metric of an installed package: simulated, swept, identified online, documented."""
+"""A transmission law, an input and a metric of an installed package, or registered in a process: simulated, swept,
+identified online, documented."""
 
 import json
 import os
@@ -137,3 +138,86 @@ def test_parts_of_an_installed_package_are_used_everywhere(tmp_path):
     assert '`[transmission]` with `law = "cubic_shaft"`' in text and '`[excitation]` with `kind = "triangle"`' in text
     assert "| `side.velocity_peak` | rad/s | largest velocity error in the last quarter |" in text
     assert "| `side.cubic_error` |  | relative error of the identified cubic |" in text
+
+
+REGISTERED = """
+import json
+import jaxbl
+from jaxbl.control import AbstractController, ControllerState
+from jaxbl.sweeps.engine import Engine
+
+study = json.loads(open("study.json").read())
+usual = study | {"transmission": {"law": "linear_shaft", "stiffness": 1.0}, "run": {"duration": 1.0, "substeps": 2}}
+usual["excitation"] = {"kind": "sine", "amplitude": 0.4, "frequency": 0.4}
+before = sorted(jaxbl.run(usual).summary["metrics"])
+
+
+class Spring(AbstractController):
+    name = "spring"
+    gain: Scalar = parameter("N m/rad", "gain")
+
+    def start(self, measured):
+        return ControllerState(0.0 * measured["motor"])
+
+    def step(self, state, feedback, target, drive, period):
+        return ControllerState(self.gain * (target.position - feedback.measured["motor"]))
+
+
+for part in (CubicShaft, Triangle, VelocityPeak, AccelerationSize, Spring):
+    jaxbl.register(part)
+
+
+@jaxbl.register
+class Triangle(Triangle):
+    def __call__(self, time):
+        return 2.0 * super().__call__(time)
+
+
+study |= {"controller": {"kind": "spring", "gain": 0.1}, "reference": {"kind": "ramp", "speed": 0.1}}
+config = jaxbl.read_config(study | {"axes": [{"path": "transmission.cubic", "values": [20.0, 40.0]}]})
+frames = {}
+for backend in ("fused", "scan"):
+    engine = Engine(config, backend=backend, require_backend=True)
+    frames[backend] = engine.run(engine.chunk(0))[["motor.velocity_peak", "motor.cubic_error"]].values.tolist()
+trace = jaxbl.run(study).trace
+faults = []
+for fault in (study | {"excitation": {"kind": "triangle", "amplitude": 0.4}}, study | {"controller": {"kind": "springs"}}):
+    try:
+        jaxbl.read_config(fault)
+    except jaxbl.InputError as error:
+        faults.append(str(error))
+for part in (int, type("Sine", (Triangle,), {"name": "sine"}), type("Half", (AbstractController,), {"name": "half"})):
+    try:
+        jaxbl.register(part)
+    except jaxbl.InputError as error:
+        faults.append(str(error))
+print(json.dumps({
+    "before": before, "after": sorted(jaxbl.run(usual).summary["metrics"]), "frames": frames, "faults": faults,
+    "input": (trace["u"] - 0.1 * (trace["reference"] - trace["theta_e"]).shift(1, fill_value=0.0))[:3].tolist(),
+}))
+"""
+
+
+def test_parts_are_registered_at_any_time(tmp_path):
+    """After the config's tables were made, after a run, and once more in the place of an earlier one."""
+    (tmp_path / "study.json").write_text(json.dumps(STUDY))
+    result = run_python("-c", SOURCE + REGISTERED, cwd=tmp_path, PYTHONPATH=str(ROOT))
+    assert result.returncode == 0, result.stderr
+    content = json.loads(result.stdout)
+    # errors of a law are metrics where it is the law
+    added = {"acceleration_size", "velocity_peak"}
+    assert set(content["after"]) - set(content["before"]) == {
+        f"{side}.{name}" for side in ("motor", "load") for name in added
+    }
+    assert content["input"] == pytest.approx([-0.8, -0.79872, -0.79744])
+    assert content["frames"]["fused"][0] != content["frames"]["fused"][1]
+    for fused, scanned in zip(*content["frames"].values(), strict=True):
+        assert fused == pytest.approx(scanned, rel=1e-9)
+    assert content["faults"] == [
+        "config: excitation.frequency: this key is missing",
+        "config: controller.kind: unknown kind 'springs'; did you mean 'spring'?",
+        "register: <class 'int'> should be a class of an input, law, effect, observer, controller, reference or metric; "
+        "a drive of one's own goes into jaxbl.Experiment as it is",
+        "register: Sine: the name 'sine' is taken",
+        "register: Half: should define start, step",
+    ]

@@ -13,6 +13,7 @@ from markdown_blocks import read_blocks
 from scipy.integrate import solve_ivp
 
 import jaxbl
+from jaxbl.control import CONTROLLERS
 from jaxbl.sweeps.engine import Engine
 
 ROOT = Path(__file__).parents[1]
@@ -31,7 +32,8 @@ def page():
                 printed = output.getvalue()
             elif block.language == "output":
                 assert block.text == printed
-    return names
+    yield names
+    CONTROLLERS._members.pop("spring")
 
 
 def integrate(derivative, state, steps, period=1e-3):
@@ -184,6 +186,14 @@ def test_a_record_needs_no_controller(page):
     np.testing.assert_allclose(again.input, signals.input, rtol=1e-9, atol=1e-12)
 
 
+def test_own_controller_in_a_study(page):
+    trace = page["sprung"].trace
+    torque = 0.1 * (0.1 * trace["t"] - trace["theta_e"]).to_numpy()
+    usual = jaxbl.run(page["study"] | {"controller": {"kind": "spring", "gain": 0.0}}).trace["u"].to_numpy()
+    assert np.abs(torque).max() > 1e-3
+    np.testing.assert_allclose((trace["u"].to_numpy() - usual)[1:], torque[:-1], atol=1e-9)
+
+
 def test_sharding_over_devices_changes_nothing(page):
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
     count = 4 * len(jax.devices())
@@ -220,6 +230,10 @@ def test_never_float32_unasked():
             lambda axis: jaxbl.experiment(dataclasses.replace(axis, controller=jaxbl.Cascade(1.0, 1.0))),
             "a controller and the reference that it follows belong together",
         ),
+        *[
+            (lambda axis, command=command: command("log.csv", axis), "a study should be a TOML file, .*, not Experiment")
+            for command in (jaxbl.identify, jaxbl.diagnose)
+        ],
     ],
 )
 def test_wrong_calls_are_told_in_one_line(call, message):

@@ -59,14 +59,18 @@ class RecordedTable(Table):
         return times, torques
 
 
-DriveTable = tagged_union([table_for(cls, kind=name) for name, cls in DRIVES.items()], "kind")
-TransmissionTable = tagged_union([table_for(cls, law=name) for name, cls in TRANSMISSIONS.items()], "law")
+def _table_of_kind(kind: str, cls: type) -> type[Table]:
+    return table_for(cls, kind=kind)
+
+
+DriveTable = tagged_union(DRIVES, _table_of_kind, "kind")
+TransmissionTable = tagged_union(TRANSMISSIONS, lambda law, cls: table_for(cls, law=law), "law")
 ExcitationTable = tagged_union(
-    [RecordedTable if name == "recorded" else table_for(cls, kind=name) for name, cls in EXCITATIONS.items()], "kind"
+    EXCITATIONS, lambda kind, cls: RecordedTable if kind == "recorded" else table_for(cls, kind=kind), "kind"
 )
-EffectTable = tagged_union([table_for(cls, partial(make_effect, name), kind=name) for name, cls in EFFECTS.items()], "kind")
-ControllerTable = tagged_union([table_for(cls, kind=name) for name, cls in CONTROLLERS.items()], "kind")
-ReferenceTable = tagged_union([table_for(cls, kind=name) for name, cls in REFERENCES.items()], "kind")
+EffectTable = tagged_union(EFFECTS, lambda kind, cls: table_for(cls, partial(make_effect, kind), kind=kind), "kind")
+ControllerTable = tagged_union(CONTROLLERS, _table_of_kind, "kind")
+ReferenceTable = tagged_union(REFERENCES, _table_of_kind, "kind")
 InitialTable = table_for(Initial)
 EncodersTable = table_for(Encoders)
 EquivalentControlTable = table_for(EquivalentControl)
@@ -117,7 +121,7 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
 
 _USUAL = "super_twisting"
 ObserverTable = Annotated[
-    tagged_union([_observer_table(name, cls) for name, cls in OBSERVERS.items()], "kind"),
+    tagged_union(OBSERVERS, _observer_table, "kind"),
     BeforeValidator(lambda table: {"kind": _USUAL} | dict(table) if isinstance(table, Mapping) else table),
 ]
 

@@ -105,6 +105,11 @@ def _read_with_includes(source: str | Path | Mapping[str, Any]) -> tuple[str, Js
         except InputError as error:
             raise InputError(f"config: {error}") from None
         return "config", *_merge_includes(copy.deepcopy(data), "config", Path(), [], [])
+    if not isinstance(source, str | Path):
+        raise InputError(
+            f"a study should be a TOML file, a mapping or a config, not {type(source).__name__}; an Experiment, whose drive "
+            "may be one of your own, is for jaxbl.simulate, metrics, observe and sweep_arrays"
+        )
     return str(Path(source)), *_file(Path(source), [], [])
 
 

@@ -4,10 +4,11 @@ A key, its unit and its range are so written once, in the module.
 """
 
 import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 
-from pydantic import Field, create_model
+from pydantic import Field, TypeAdapter, WrapValidator, create_model
 
 from jaxbl.drive.parameters import config_key, parameters
 from jaxbl.validation import Positive, StrictTable
@@ -73,6 +74,25 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
     return model
 
 
-def tagged_union(tables: list[type[Table]], key: str) -> Any:
-    """The type of a table that is one of several, told apart by the value of a key (`kind`, `law`)."""
-    return Annotated[Union[tuple(tables)], Field(discriminator=key)]  # noqa: UP007
+def tagged_union(members: Mapping[str, type], make_table: Callable[[str, type], type[Table]], key: str) -> Any:
+    """The type of a table that is one of several, told apart by the value of a key (`kind`, `law`).
+
+    Members that are registered later (:func:`jaxbl.register`) are taken as well.
+    """
+    make_table = functools.cache(make_table)
+
+    def combine() -> Any:
+        tables = tuple(make_table(name, cls) for name, cls in members.items())
+        return Annotated[Union[tables], Field(discriminator=key)]  # noqa: UP007
+
+    @functools.lru_cache(1)
+    def adapt(_: tuple[type, ...]) -> TypeAdapter[Any]:
+        return TypeAdapter(combine())
+
+    known = tuple(members.values())
+
+    def validate(table: Any, validate_known: Callable[[Any], Any]) -> Any:
+        now = tuple(members.values())
+        return validate_known(table) if now == known else adapt(now).validate_python(table)
+
+    return Annotated[combine(), WrapValidator(validate)]

@@ -62,14 +62,13 @@ class _Metrics(Registry):
     """Metrics by name, with errors of identified parameters that transmission laws of other packages add."""
 
     def _load_all(self) -> dict[str, Any]:
-        if not self._loaded:
-            super()._load_all()
-            for law in TRANSMISSIONS.values():
-                for name, parameter in law.errors.items():
-                    if name not in self._members:
-                        doc = f"relative error of the identified {parameter}"
-                        self._members[name] = IdentificationError.of(name, "", f"error of {parameter}", doc)
-        return self._members
+        members = super()._load_all()
+        for law in TRANSMISSIONS.values():
+            for name, parameter in law.errors.items():
+                if name not in members:
+                    doc = f"relative error of the identified {parameter}"
+                    members[name] = IdentificationError.of(name, "", f"error of {parameter}", doc)
+        return members
 
 
 SIDE_METRICS = _Metrics("jaxbl.metrics", _check_metric)
@@ -479,6 +478,10 @@ _OVERFLOW_METRICS = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", 
 def _select_metrics(kind: type[Metric], names: MetricNames = None) -> dict[str, Any]:
     """The requested metrics of a kind by name."""
     return {name: cls() for name, cls in SIDE_METRICS.items() if issubclass(cls, kind) and (names is None or name in names)}
+
+
+clear_metrics = _select_metrics.cache_clear
+"""Forget the selections of metrics, to be called as another one is registered."""
 
 
 def _loop_metrics(experiment: Experiment, names: MetricNames) -> dict[str, RunMetric]:
