@@ -100,11 +100,11 @@ def register(part: _Part) -> _Part:
     cls: Any = part
     for base, registry in _REGISTRIES.items():
         if isinstance(cls, type) and issubclass(cls, base):
-            names = [f"{place}.{cls.kind}" for place in cls.places] if issubclass(cls, AbstractEffect) else [cls.name]
             try:
+                names = [f"{place}.{cls.kind}" for place in cls.places] if base is AbstractEffect else [cls.name]
                 for name in names:
                     registry.register(name, cls)
-            except (TypeError, ValueError) as error:
+            except (AttributeError, TypeError, ValueError) as error:
                 raise InputError(f"register: {cls.__name__}: {error}") from None
             # traces of before do not know it
             clear_metrics()

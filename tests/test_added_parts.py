@@ -186,7 +186,8 @@ for fault in (study | {"excitation": {"kind": "triangle", "amplitude": 0.4}}, st
         jaxbl.read_config(fault)
     except jaxbl.InputError as error:
         faults.append(str(error))
-for part in (int, type("Sine", (Triangle,), {"name": "sine"}), type("Half", (AbstractController,), {"name": "half"})):
+wrong = int, type("Sine", (Triangle,), {"name": "sine"}), type("Half", (AbstractController,), {"name": "half"})
+for part in (*wrong, type("Nameless", (AbstractController,), {})):
     try:
         jaxbl.register(part)
     except jaxbl.InputError as error:
@@ -220,4 +221,5 @@ def test_parts_are_registered_at_any_time(tmp_path):
         "a drive of one's own goes into jaxbl.Experiment as it is",
         "register: Sine: the name 'sine' is taken",
         "register: Half: should define start, step",
+        "register: Nameless: type object 'Nameless' has no attribute 'name'",
     ]
