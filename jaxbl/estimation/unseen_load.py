@@ -161,16 +161,20 @@ class UnseenLoad:
     def frictions(self) -> list[list[tuple[int, float]]]:
         """Places of viscous and of dry frictions among the free numbers, motor and load, and the factor that makes each one
         at the motor."""
-        plant, places = self.experiment.plant, {number.path: i for i, number in enumerate(self.free)}
-        ratio = float(plant.drive.ratio("load"))
-        viscous = {"drive.motor_viscous": 1.0, "drive.load_viscous": ratio**-2.0}
+        experiment = self.experiment
+        viscous = {"drive.motor_viscous": "motor", "drive.load_viscous": "load"}
         dry = {
-            f"effects.{effect.name}.torque": 1.0 if effect.place == "motor" else 1.0 / ratio
-            for effect in plant.effects
+            f"effects.{effect.name}.torque": effect.place
+            for effect in experiment.effects
             if type(effect).dry_friction is not AbstractEffect.dry_friction
         }
         return [
-            [(places[path], factor) for path, factor in places_of.items() if path in places] for places_of in (viscous, dry)
+            [
+                (i, float(experiment.drive.ratio(side_of[number.path])) ** -power)
+                for i, number in enumerate(self.free)
+                if number.path in side_of
+            ]
+            for power, side_of in ((2, viscous), (1, dry))
         ]
 
     def beginnings(self) -> list[np.ndarray]:
@@ -507,9 +511,9 @@ class GapSearch:
         self.place: int = model.gap
         # the same with the gap as it is
         self.model_held, self.coarse_held = (replace(fits, held=[self.place]) for fits in (model, self.coarse))
-        known = [i for i, number in enumerate(model.free) if is_known(number)]
+        stated = [i for i, number in enumerate(model.free) if is_known(number)]
         part = [max(model.segments, key=len)[:_PART]]
-        self.part = replace(self.coarse, held=[*known, self.place], segments=part)
+        self.part = replace(self.coarse, held=[*stated, self.place], segments=part)
         self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
 
     def _with_gap(self, half: float, theta: np.ndarray) -> np.ndarray:
