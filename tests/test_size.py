@@ -8,27 +8,29 @@ import size
 from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
-# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why. 395 804 in all is
-# 393 921 and what the engine as functions takes: for it and for the loop closed a sum of 10 000 more is named. `report` and
-# `records` are above what they were, by the explorer and by logs as people write them; `gains`, `throughput` and `sweeps`
-# pay for these.
+# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why. 403 229 in all: for the
+# engine as functions and the loop closed a sum of 10 000 above 393 921 is named, and 9 308 of these are spent. `control` and
+# what it needs of `sweeps`, `.`, `config` and `exports` are of the loop closed; `records`, `monitoring`, `.`, `cli` and
+# `exports` are above what they were by streams that do not go blind, costs said beforehand, logs read without a hand, and C
+# in float at any turn; `estimation` and `diagnosis` pay for a part.
 CEILINGS = {
-    "all": (395804, 0.03, 0.27, 0.0),
-    "report": (62006, 0.11, 0.95, 0.0),
-    "diagnosis": (59529, 0.0, 0.0, 0.0),
-    "records": (49434, 0.0, 0.0, 0.0),
-    "gains": (36899, 0.0, 0.0, 0.0),
-    "estimation": (34386, 0.0, 0.0, 0.0),
-    "sweeps": (28408, 0.07, 0.0, 0.0),
-    "exports": (22708, 0.02, 0.0, 0.0),
+    "all": (403229, 0.03, 0.23, 0.0),
+    "report": (62123, 0.1, 0.9, 0.0),
+    "diagnosis": (59476, 0.0, 0.0, 0.0),
+    "records": (51244, 0.0, 0.0, 0.0),
+    "gains": (36987, 0.0, 0.0, 0.0),
+    "estimation": (33582, 0.0, 0.0, 0.0),
+    "sweeps": (29591, 0.08, 0.0, 0.0),
+    "exports": (23625, 0.02, 0.0, 0.0),
     "fused": (24243, 0.0, 0.0, 0.0),
-    ".": (21351, 0.02, 0.0, 0.0),
-    "drive": (12893, 0.0, 1.67, 0.0),
+    ".": (22456, 0.0, 0.0, 0.0),
+    "drive": (13042, 0.0, 1.62, 0.0),
     "throughput": (10661, 0.0, 0.0, 0.0),
-    "cli": (9462, 0.09, 0.0, 0.0),
-    "config": (9334, 0.0, 0.0, 0.0),
+    "cli": (9744, 0.09, 0.0, 0.0),
+    "config": (9709, 0.0, 0.0, 0.0),
     "observer": (8962, 0.0, 0.0, 0.0),
-    "monitoring": (5528, 0.0, 0.0, 0.0),
+    "monitoring": (5877, 0.0, 0.0, 0.0),
+    "control": (1907, 0.0, 0.0, 0.0),
 }
 
 

@@ -89,10 +89,10 @@ def tagged_union(members: Mapping[str, type], make_table: Callable[[str, type], 
     def adapt(_: tuple[type, ...]) -> TypeAdapter[Any]:
         return TypeAdapter(combine())
 
-    known = tuple(members.values())
+    tables = tuple(members.values())
 
     def validate(table: Any, validate_known: Callable[[Any], Any]) -> Any:
         now = tuple(members.values())
-        return validate_known(table) if now == known else adapt(now).validate_python(table)
+        return validate_known(table) if now == tables else adapt(now).validate_python(table)
 
     return Annotated[combine(), WrapValidator(validate)]

@@ -20,7 +20,7 @@ from .references import Target
 
 
 class Feedback(NamedTuple):
-    """What a controller sees at a sample, by side.
+    """Holds what a controller sees at a sample, by side.
 
     Attributes:
         measured: readings, rad; a missed one is replaced by the observer's prediction.

@@ -17,7 +17,7 @@ from jaxbl.registry import Registry, check_module
 
 
 class Target(NamedTuple):
-    """What a side is to do at a sample: position (rad), velocity (rad/s), acceleration (rad/s^2)."""
+    """Says what a side is to do at a sample: position (rad), velocity (rad/s), acceleration (rad/s^2)."""
 
     position: Any
     velocity: Any
@@ -31,16 +31,16 @@ class AbstractReference(eqx.Module):
 
     @abc.abstractmethod
     def position(self, time: ScalarArray) -> Any:
-        """Position (rad) at a time (s)."""
+        """Return the position (rad) at a time (s)."""
 
     def target(self, time: ScalarArray) -> Target:
-        """Position and its derivatives at a time (s); at a jump the derivatives are those beside it."""
-        one = jnp.ones_like(time)
+        """Return position and its derivatives at a time (s); at a jump the derivatives are those beside it."""
+        unit = jnp.ones_like(time)
 
-        def move(at: ScalarArray) -> Any:
-            return jax.jvp(self.position, (at,), (one,))
+        def move(moment: ScalarArray) -> Any:
+            return jax.jvp(self.position, (moment,), (unit,))
 
-        (position, velocity), (_, acceleration) = jax.jvp(move, (time,), (one,))
+        (position, velocity), (_, acceleration) = jax.jvp(move, (time,), (unit,))
         return Target(position, velocity, acceleration)
 
 
@@ -98,7 +98,7 @@ class StepsReference(AbstractReference):
 
 @REFERENCES.add
 class Moves(AbstractReference):
-    """Moves from 0 to `distance` and back by S-curves of least jerk, x = 10 s^3 - 15 s^4 + 6 s^5, with a rest after each.
+    """Moves from 0 to `distance` and back by S-curves of least jerk, x = 10 s^3 - 15 s^4 + 6 s^5, with a pause after each.
 
     Reference: T. Flash, N. Hogan, J. Neuroscience 5 (1985).
     """
@@ -106,11 +106,11 @@ class Moves(AbstractReference):
     name = "moves"
     distance: Scalar = parameter("rad", "distance of a move")
     duration: Scalar = parameter("s", "duration of a move", above=0.0)
-    rest: Scalar = parameter("s", "rest after each move", default=0.5, minimum=0.0)
+    pause: Scalar = parameter("s", "pause after each move", default=0.5, minimum=0.0)
 
     def position(self, time):
-        cycles = time / (self.duration + self.rest)
+        cycles = time / (self.duration + self.pause)
         move = jnp.floor(cycles)
-        s = jnp.minimum((cycles - move) * (self.duration + self.rest) / self.duration, 1.0)
+        s = jnp.minimum((cycles - move) * (self.duration + self.pause) / self.duration, 1.0)
         rise = s * s * s * (10.0 + s * (6.0 * s - 15.0))
         return self.distance * jnp.where(jnp.mod(move, 2.0) == 0.0, rise, 1.0 - rise)

@@ -63,7 +63,7 @@ class _Kind(NamedTuple):
 
 
 def _of_summary(describe: Callable[[Any], Result]) -> Callable[[Any], Result]:
-    return lambda found: describe(found.summary)
+    return lambda result: describe(result.summary)
 
 
 def _log(result: Any) -> Subject:
@@ -84,7 +84,7 @@ _KINDS = {
         draw_inspection,
         write_inspection,
         "inspection.json",
-        lambda found: log_subject(found.record.path),
+        lambda result: log_subject(result.record.path),
     ),
     Identification: _Kind(
         _of_summary(describe_identification), draw_identification, write_identification, "identification.json", _log
