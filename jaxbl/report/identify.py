@@ -29,7 +29,8 @@ def describe_identification(summary: JsonObject) -> Result:
     if not numbers:
         verdict, headline = "no answer", "This log identifies none of the model's numbers."
     elif not complete:
-        verdict, headline = "doubtful", f"The model does not explain the log: more than noise is left ({size})."
+        verdict = "doubtful"
+        headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
     tables = [_parameter_table(summary, parameters)]
     if "regression" in method:
         tables.append(_regression_table(method["regression"]))
@@ -39,8 +40,10 @@ def describe_identification(summary: JsonObject) -> Result:
         tables.append(ResultTable("Recursive identification, at the end of the log", columns, rows))
     remarks = [*summary["warnings"], *_far_off(parameters)]
     if lacks := (summary.get("rejected") or {}).get("lacks"):
-        lead = f"{percent(lacks['share'])} of the torque left over on the {lacks['equation']}"
-        remarks.append(f"{lead} goes with its {lacks['channel']}: an effect is missing.")
+        remarks.append(
+            f"{percent(lacks['share'])} of the torque left over on the {lacks['equation']} goes with its "
+            f"{lacks['channel']}: an effect is missing."
+        )
     remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
     title = summary["title"] or f"Identification from {Path(summary['file']).name}"
     figures = [*_backlash(summary), *number_figures(numbers)][:4]

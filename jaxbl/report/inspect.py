@@ -71,7 +71,7 @@ def describe_inspection(inspection: Inspection) -> Result:
     figures += [
         KeyFigure(
             f"{channel.noise:.2g} {channel.unit}",
-            f"noise of {name}, rms; its motion is over {channel.largest - channel.least:.3g}",
+            f"noise of {name}, rms; the motion spans {channel.largest - channel.least:.3g} {channel.unit}",
         )
         for name, channel in record.statistics.channels.items()
         if name.startswith("theta")

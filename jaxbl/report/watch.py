@@ -57,7 +57,8 @@ def describe_watch(watch: Watch) -> Result:
             f"the window of {summary['window']:g} s."
         )
     elif limit is not None:
-        headline = f"No alarm: at none of {count} values was the half gap surely beyond {limit:g} {units['half_gap']}."
+        gap = f"{last['half_gap']:.4g} (95 %: at most {last['half_gap_to']:.4g})"
+        headline = f"No alarm: the half gap is {gap}, and the limit {limit:g} {units['half_gap']}."
     ends = [summary[end] or {} for end in ("first", "last")]
     rows = [
         [f"{side}: {label}", *(values.get(f"{side}.{name}{kind}") for values in ends for kind in ("", "_error")),
