@@ -316,6 +316,8 @@ class UnseenLoad:
         theta, start = np.split(change, [len(self.free)])
         return point._replace(theta=point.theta + theta, start=point.start + start.reshape(point.start.shape))
 
+    # far from the solution errors may be so large that their squares are not finite: no step gains there
+    @np.errstate(all="ignore")
     def solve(self, point: Point, steps: int) -> Point:
         """Levenberg-Marquardt from a point, with its predictor."""
         best, damping, size = point, 1e-3, None
@@ -327,7 +329,6 @@ class UnseenLoad:
             size = np.diag(matrix) ** -0.5
             towards = slope.T @ best.errors / best.variance + self.precision * best.away
             towards[self.held] = 0.0
-            gained = 0.0
             for _ in range(_MOST_REJECTED):
                 change = -np.linalg.solve(matrix + damping * np.diag(size**-2.0), towards)
                 following = self.evaluate(self._move(best, np.clip(change, -1.0, 1.0)))
@@ -359,13 +360,12 @@ class UnseenLoad:
         to the one that suits the model."""
         coarse = self.coarse()
         begun = [coarse.begin(theta, _FOLLOWING[-1]) for theta in thetas or self.beginnings()]
-        ends = [coarse.finish(coarse.solve(point, _MORE)) for point in begun]
-        return self.finish(_likeliest(ends))
+        return self.finish(_likeliest([coarse.finish(coarse.solve(point, _MORE)) for point in begun]))
 
     def measure_unexplained(self, point: Point) -> float:
         """Torque that moves the motor beside the model's by the predictor that suits best, white, N m rms a sample."""
         inertia = self.number("drive.motor_inertia", point.theta)
-        return inertia * float(np.sqrt(point.smoothness)) * self.noise / self.period**2
+        return inertia * point.smoothness**0.5 * self.noise / self.period**2
 
     def settle(self, point: Point) -> tuple[Point, Spread]:
         """Find the best of a point and of fits beside it, and the covariance there.
