@@ -8,18 +8,18 @@ import size
 from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
-# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why. 403 229 in all: for
-# the engine as functions and the loop closed a sum of 10 000 above 393 921 is named, and 9 308 of these are spent. `control`
+# Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why. 403 215 in all: for
+# the engine as functions and the loop closed a sum of 10 000 above 393 921 is named, and 9 294 of these are spent. `control`
 # and what it needs of `sweeps`, `.`, `config` and `exports` are of the loop closed; `records`, `monitoring`, `.`, `cli` and
 # `exports` are above what they were by streams that do not go blind, costs said beforehand, logs read without a hand, and C
 # in float at any turn; `estimation` and `diagnosis` pay for a part.
 CEILINGS = {
-    "all": (403229, 0.03, 0.23, 0.0),
+    "all": (403215, 0.03, 0.23, 0.0),
     "report": (62123, 0.1, 0.9, 0.0),
-    "diagnosis": (59476, 0.0, 0.0, 0.0),
+    "diagnosis": (59465, 0.0, 0.0, 0.0),
     "records": (51244, 0.0, 0.0, 0.0),
     "gains": (36987, 0.0, 0.0, 0.0),
-    "estimation": (33582, 0.0, 0.0, 0.0),
+    "estimation": (33579, 0.0, 0.0, 0.0),
     "sweeps": (29591, 0.08, 0.0, 0.0),
     "exports": (23625, 0.02, 0.0, 0.0),
     "fused": (24243, 0.0, 0.0, 0.0),

@@ -10,13 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.errors import InputError
 
 from .blocks import standard_errors_better
 from .confidence import Finding, weigh
-from .effect_search import EffectSearch, Explanation, UnfeltInput, VerdictName
+from .effect_search import EffectSearch, Explanation, VerdictName
 from .expected_errors import expected_errors, list_failed
 from .fitted_model import FittedModel
 from .history import Step
@@ -71,6 +70,10 @@ class Chosen(NamedTuple):
         return "explained" if self.fitted.names else "no_discrepancy"
 
 
+class _UnfeltInput(Exception):
+    """Noise of the input did not act on the machine: the set-up without it, and what the model has that shows it."""
+
+
 class Choice:
     """Finds the model that stands.
 
@@ -84,7 +87,7 @@ class Choice:
         self._begin(setup)
 
     def _begin(self, setup: Setup, *history: Step) -> None:
-        self.setup, self.log, self._quieter = setup, setup.fitted, None
+        self.setup, self.log = setup, setup.fitted
         # a linear axis has no turns
         rotary = [name for name, kind in EFFECTS.items() if kind.rotary and name.partition(".")[0] in setup.sliding]
         stated, sought = setup.task.config.uncertainty, candidates(setup.bare)
@@ -95,23 +98,24 @@ class Choice:
             )
         exact = *stated.exact, *rotary
         prior = setup.prior.tolist()
-        self.search = EffectSearch(setup.bare, setup.free, prior, self.log, exact, stated.expected, self._is_felt)
+        self.search = EffectSearch(setup.bare, setup.free, prior, self.log, exact, stated.expected, self._check_input)
         self.search.history += history
         self.before = self.log.compare(setup.nominal)
 
-    def _is_felt(self, model: Experiment) -> bool:
-        """Tell whether the machine felt the input that drives models, by one of them."""
-        self._quieter = doubt_input(self.setup, model)
-        return self._quieter is None
+    def _check_input(self, fitted: FittedModel) -> None:
+        """End the search if a model shows that the machine did not feel noise of the input that drives models."""
+        quieter = doubt_input(self.setup, fitted.experiment)
+        if quieter is not None:
+            raise _UnfeltInput(quieter, " and ".join(fitted.names) or "other numbers")
 
     def choose(self) -> Chosen:
         """Search for effects, and settle the numbers."""
         try:
             explanation = self.search.run()
-        except UnfeltInput as unfelt:
-            assert self._quieter is not None
-            reason = f"a model with {' and '.join(*unfelt.args)} shows that the machine did not feel it"
-            self._begin(self._quieter, Step("drive models without noise of the input", None, None, True, reason))
+        except _UnfeltInput as unfelt:
+            setup, shown_by = unfelt.args
+            reason = f"a model with {shown_by} shows that the machine did not feel it"
+            self._begin(setup, Step("drive models without noise of the input", None, None, True, reason))
             return self.choose()
         fitted, compared = explanation.fitted, self.search.compare(explanation.fitted)
         if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.difference:

@@ -109,10 +109,6 @@ class _Proposal(NamedTuple):
     variant: Candidate | None = None
 
 
-class UnfeltInput(Exception):
-    """Noise of the recorded input did not act on the machine: a model with these effects shows it."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Explanation:
     """The effects that a model lacks by a log.
@@ -147,7 +143,7 @@ class EffectSearch:
         log: ReferenceLog,
         exact: Collection[str] = (),
         expected: Collection[str] = (),
-        is_felt: Callable[[Experiment], bool] = lambda model: True,
+        check_model: Callable[[FittedModel], None] = lambda fitted: None,
     ):
         """Prepare to explain a log.
 
@@ -157,9 +153,9 @@ class EffectSearch:
             log: the log.
             exact: dotted paths of numbers that are known, and names of effects that are surely not missing.
             expected: names of effects that surely act: they are in the model from the first, and stay.
-            is_felt: whether by a model the machine felt all of the recorded input; asked of each that is accepted.
+            check_model: called with each model that is accepted; it ends the search by an exception.
         """
-        self.log, self.expected, self.is_felt, stated = log, expected, is_felt, np.asarray(prior)
+        self.log, self.expected, self.check_model, stated = log, expected, check_model, np.asarray(prior)
         self.fits = self.stated = ModelFits(experiment, free, stated, log.segments)
         rough = np.hypot(stated, LIMITS.number_error)
         self.rough = ModelFits(experiment, free, rough, log.segments, LIMITS.effect_odds)
@@ -210,11 +206,7 @@ class EffectSearch:
     # ---- the loop ----
 
     def run(self) -> Explanation:
-        """Find what is missing.
-
-        Raises:
-            UnfeltInput: noise of the recorded input stands in the way.
-        """
+        """Find what is missing."""
         explanation = self._explain(self._begin())
         if self.fits is self.rough and self.passed_by is not None and not explanation.largest_gain > LIMITS.unknown:
             # a few effects may be likelier than numbers that are all off
@@ -244,8 +236,8 @@ class EffectSearch:
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
             current, gains = self._reduce(better or current, thorough=thorough)
-            if better is not None and not self.is_felt(current.experiment):
-                raise UnfeltInput(current.names)
+            if better is not None:
+                self.check_model(current)
             if better is not None or self._identify(current) not in visited:
                 continue
             rivals = {name: self._rivals(current, name) for name in current.names}

@@ -98,7 +98,7 @@ def set_up(task: DiagnosisTask) -> Setup:
 
 
 def doubt_input(setup: Setup, model: Experiment) -> Setup | None:
-    """Set up anew if a model that explains more than the nominal one shows that noise of the input did not act."""
+    """Set up anew if a model shows that noise of the recorded input did not act; None if it does not."""
     if setup.input_noise.unfelt > 0.0:
         return None
     noise = _input_noise(input_rms(setup.task.record), model, setup.recorded)

@@ -95,7 +95,7 @@ def note_damping(experiment: Experiment) -> list[str]:
     }
     return [
         f"The observers cannot run at this period: the {side}'s viscous friction times {1e3 * period:.4g} ms over its "
-        f"inertia is {ratio:.3g}; below {_STABLE_DAMPING:g} they can, at a shorter period."
+        f"inertia is {ratio:.3g}; it should be below {_STABLE_DAMPING:g}: record at a shorter period."
         for side, ratio in ratios.items()
         if ratio >= _STABLE_DAMPING
     ]

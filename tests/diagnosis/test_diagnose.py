@@ -81,7 +81,8 @@ def test_noise_of_the_input_is_asked_for_again_once_a_model_explains_more(tmp_pa
     with jax.enable_x64(True):
         assert set_up(task).input_noise.unfelt == 0.0
     summary = diagnose(tmp_path / "axis.csv", nominal_study()).summary
-    assert summary["history"][0]["tried"] == "drive models without noise of the input"
+    first = summary["history"][0]
+    assert first["tried"] == "drive models without noise of the input" and "motor.coulomb_friction" in first["why"]
     assert [finding["effect"] for finding in summary["findings"]] == ["motor.coulomb_friction"]
     assert any(note.startswith("The channel u carries noise of 0.004") for note in summary["notes"])
 
