@@ -1,13 +1,7 @@
-"""Figures of `jaxbl identify`. Those of motion and torque are the analogues of Figs. 18 to 28 of the paper.
-
-Where a log is long they show the few cycles with the largest motion in detail, and the whole of it in outline.
-"""
-
-from typing import Any
+"""Figures of `jaxbl identify`: torque over twist or velocity, numbers with intervals, and what the model leaves."""
 
 import numpy as np
 
-from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.identify import Identification
 from jaxbl.lines import percent
 from jaxbl.quantity import Quantity
@@ -21,9 +15,7 @@ from .panels import (
     GREEN,
     PURPLE,
     SIDE_COLOURS,
-    SKY,
     TIME,
-    ZERO,
     Array,
     Axis,
     Figure,
@@ -40,10 +32,7 @@ from .panels import (
     name_rows,
     shade_gap,
     stack,
-    with_unit,
 )
-
-_MEASURED = GREEN
 
 
 def draw_identification(result: Identification) -> list[Figure]:
@@ -51,15 +40,8 @@ def draw_identification(result: Identification) -> list[Figure]:
     log = LogSignals(result)
     if "backlash" in result.summary:
         return [_intervals(result), *draw_motor_alone(result), _residuals(log)]
-    first, *more = [_hysteresis, _torque, _limit_cycle] if log.geared else [_friction, _resistance]
-    figures = [first(log), _intervals(result), _residuals(log), *(draw(log) for draw in more), _velocities(log)]
-    return [*figures, _path(log)] if result.summary["method"]["recursive"] else figures
-
-
-def _line(log: LogSignals, values: Array, name: str, rows: slice | None = None, **how: Any) -> Line:
-    """A signal over time, broken at gaps."""
-    time, values = join(log.time, log.parts(rows), values)
-    return Line(time, values, name, **how)
+    first = _hysteresis if log.geared else _friction
+    return [first(log), _intervals(result), _residuals(log)]
 
 
 def _intervals(result: Identification) -> Figure:
@@ -99,7 +81,8 @@ def _residuals(log: LogSignals) -> Figure:
     for side, sizes in log.found.summary["residual"].items():
         unit, rms, noise = log.unit[side], sizes["rms"], sizes["noise"]
         name = f"rms {rms:.2g} {unit}, {rms / noise:.3g} times the noise"
-        parts = [_line(log, log[f"{side}.residual"], name, colour=SIDE_COLOURS[side], width=0.7)]
+        time, residual = join(log.time, log.record.segments, log[f"{side}.residual"])
+        parts: list[Part] = [Line(time, residual, name, SIDE_COLOURS[side], 0.7)]
         parts += [Span(end, end, "± 2 noise", along="y", width=0.9) for end in (-2.0 * noise, 2.0 * noise)]
         panels.append(Panel(TIME, Axis(f"{side}: measured\n− model ({unit})"), parts))
     return stack(
@@ -108,78 +91,6 @@ def _residuals(log: LogSignals) -> Figure:
         "Measured position less that of the fitted model, window by window. Noise alone leaves the dashed lines in one "
         "sample of twenty; longer swings beyond them are an effect that the model lacks.",
         2.0,
-    )
-
-
-def _pair(log: LogSignals, above: tuple[Axis, list[Part]], below: tuple[Axis, list[Part]]) -> list[Panel]:
-    """Signals in detail, and below their differences over the whole record."""
-    axes, marked = [TIME] * 2, []
-    if not log.whole:
-        ends = float(log.time[0]), float(log.time[-1])
-        axes = [Axis("time (s)", ends=log.span), Axis("time (s), all of the record", ends=ends)]
-        marked = [Span(*log.span, colour=SKY)]
-    return [Panel(axes[0], *above), Panel(axes[1], below[0], [ZERO, *marked, *below[1]])]
-
-
-def _where(log: LogSignals) -> str:
-    if log.whole:
-        return ""
-    low, high = log.span
-    return f" Above: {low:.4g} to {high:.4g} s, where the motion is largest (shaded below)."
-
-
-def _velocities(log: LogSignals) -> Figure:
-    pairs = []
-    for side in log.sides:
-        smoothed, estimate, unit = log[f"{side}.velocity"], log[f"{side}.velocity_estimate"], f"{log.unit[side]}/s"
-        lines: list[Part] = [
-            _line(log, estimate, "observer", log.detail, colour=SIDE_COLOURS[side], width=2.6, opacity=0.75),
-            _line(log, smoothed, "smoother", log.detail, width=0.9),
-        ]
-        above = Axis(f"{side} velocity ({unit})", ends=limits(smoothed[log.detail], estimate[log.line]))
-        error = estimate - smoothed
-        share = log.rms(error) / (log.rms(smoothed) or 1.0)
-        name = f"rms {log.rms(error):.2g} {unit} ({percent(share)})"
-        below = Axis(f"difference ({unit})", ends=limits(error[log.settled], room=0.4))
-        difference = _line(log, error, name, colour=SIDE_COLOURS[side], width=0.8)
-        pairs.append(_pair(log, (above, lines), (below, [difference])))
-    return Figure(
-        "velocities",
-        [panel for row in zip(*pairs, strict=True) for panel in row],
-        "Velocities by the observers, which use past samples only, and by the zero-phase smoother, which uses the whole log "
-        f"(cf. Figs. 18, 19, 22 and 23). Below: observer − smoother; rms without the first tenth.{_where(log)}",
-        columns=len(pairs),
-        width=9.0 if len(pairs) > 1 else 6.8,
-        height=2.2,
-    )
-
-
-def _torque(log: LogSignals) -> Figure:
-    law, measured, unit = log.low_passed(log["torque"]), log.measured_torque, log.torque_unit
-    reference, name = (law, "law") if measured is None else (measured, "measured")
-    errors = {side: torque - reference for side, torque in log.torques.items()}
-    above, below = list[Part](), list[Part]()
-    # the noisier one first, so that it does not hide the other
-    for side in sorted(log.sides, key=lambda side: -log.rms(errors[side])):
-        torque, error, colour = log.torques[side], errors[side], SIDE_COLOURS[side]
-        above.append(_line(log, torque, f"by the {side} side", log.detail, colour=colour, width=2.4, opacity=0.75))
-        text = f"{side} side − {name}, rms {log.rms(error):.2g} {unit}"
-        below.append(_line(log, error, text, colour=colour, width=0.8, opacity=0.8))
-    signals, error = [*log.torques.values(), law], law - reference
-    if measured is not None:
-        signals.append(measured)
-        above.append(_line(log, measured, "measured", log.detail, colour=_MEASURED, width=1.6))
-        below.append(_line(log, error, f"law − measured, rms {log.rms(error):.2g} {unit}", width=0.8))
-    above.append(_line(log, law, "fitted law at the measured twist", log.detail, width=1.0, dashes="--"))
-    ends = limits(*(signal[log.settled] - reference[log.settled] for signal in signals), room=0.3)
-    axes = Axis(f"transmitted torque ({unit})", ends=limits(*(signal[log.line] for signal in signals)))
-    return Figure(
-        "torque",
-        _pair(log, (axes, above), (Axis(f"difference ({unit})", ends=ends), below)),
-        "Transmitted torque: by the equivalent control of each side less the fitted effects on that side, and by the fitted "
-        "law at the measured twist, all behind the same low-pass. Where a side differs from the law, the law or that side's "
-        f"equation of motion is incomplete.{_where(log)}",
-        height=2.4,
     )
 
 
@@ -237,44 +148,6 @@ def _hysteresis(log: LogSignals) -> Figure:
     )
 
 
-def _limit_cycle(log: LogSignals) -> Figure:
-    unit, twist, rate, rows = log.unit["motor"], log["twist"], log.rate, log.settled
-    parts = [*_gap_parts(log), ZERO, cloud(twist[rows], rate[rows])]
-    parts.append(Line(twist[log.line], rate[log.line], colour=PURPLE))
-    x = Axis(f"twist θe − N₀ θs ({unit})", ends=limits(twist[rows]))
-    y = Axis(f"twist rate by the smoother ({unit}/s)", ends=limits(rate[rows]))
-    caption = "Limit cycle: rate of the twist over the twist (cf. Fig. 28), run through clockwise. "
-    if log.plant.half_gap:
-        caption += "Free flight crosses the shaded gap; outside of it the gear is in contact. "
-    if log.whole:
-        caption += "The line is all of the record but its first tenth."
-    else:
-        low, high = log.span
-        caption += f"The line is {low:.4g} to {high:.4g} s, where the motion is largest; grey is all but the first tenth."
-    return Figure("limit_cycle", [Panel(x, y, parts)], caption)
-
-
-def _resistance(log: LogSignals) -> Figure:
-    """The torque of a rigid drive beyond its nominal equation, over time."""
-    unit, estimate, effects = log.torque_unit, log["motor.torque_estimate"], log.effects("motor")
-    fitted, colour = np.zeros(len(estimate)) if effects is None else effects, SIDE_COLOURS["motor"]
-    lines: list[Part] = [
-        _line(log, estimate, "observer", log.detail, colour=colour, width=2.2, opacity=0.75),
-        _line(log, fitted, "fitted effects", log.detail, width=1.0, dashes="--"),
-    ]
-    error, quantity = estimate - fitted, missing_quantity(unit)
-    difference = _line(log, error, f"rms {log.rms(error):.2g} {unit}", colour=colour, width=0.8)
-    above = Axis(f"resisting {quantity} ({unit})", ends=limits(estimate[log.line], fitted[log.line]))
-    below = Axis(f"difference ({unit})", ends=limits(error[log.settled], room=0.3))
-    return Figure(
-        "resistance",
-        _pair(log, (above, lines), (below, [difference])),
-        f"The {quantity} beyond inertia and viscous friction, by the equivalent control of the observer and by the fitted "
-        f"effects, behind the same low-pass. Below: observer − effects; rms without the first tenth.{_where(log)}",
-        height=2.3,
-    )
-
-
 def _friction(log: LogSignals) -> Figure:
     """The torque of a rigid drive beyond its nominal equation, over velocity."""
     unit, rows = log.torque_unit, log.settled
@@ -284,7 +157,7 @@ def _friction(log: LogSignals) -> Figure:
     # a line of the observer's own torque, which chatters, would fill the panel
     parts = _means(log, velocity, estimate, np.gradient(velocity), "velocity", across)
     if effects is not None:
-        parts.append(Line(velocity[log.line], effects[log.line], "fitted effects", width=1.2))
+        parts.append(Line(velocity[rows], effects[rows], "fitted effects", width=1.2))
     x = Axis(f"velocity by the smoother ({log.unit['motor']}/s)", ends=across)
     y = Axis(f"resisting {quantity} ({unit})", ends=limits(estimate[rows]))
     return Figure(
@@ -293,33 +166,4 @@ def _friction(log: LogSignals) -> Figure:
         f"The {quantity} beyond inertia and viscous friction over velocity, behind the same low-pass: friction as the log "
         "shows it (grey: samples by the observer, without the first tenth; lines: their means for either direction of the "
         "acceleration), and as fitted. The low-pass slants the reversals.",
-    )
-
-
-def _path(log: LogSignals) -> Figure:
-    result, panels = log.found, []
-    late = slice((log.observed.start + log.observed.stop) // 2, log.observed.stop)
-    # what a law derives from its own parameters is an angle, as they are
-    units = units_of(log.experiment.transmission)
-    for name in result.summary["method"]["recursive"]:
-        values, path = {side: log[f"{side}.{name}"] for side in log.sides}, f"transmission.{name}"
-        parts: list[Part] = [
-            _line(log, signal, f"recursive, {side} side", log.observed, colour=SIDE_COLOURS[side])
-            for side, signal in values.items()
-        ]
-        ends, fitted = [signal[late] for signal in values.values()], result.parameters.get(path)
-        if fitted is not None:
-            low, high = fitted.ends()
-            parts.insert(0, Span(low, high, colour=BLACK, along="y", opacity=0.15))
-            parts.append(Span(fitted.value, fitted.value, "trajectory fit, 95 %", along="y"))
-            ends.append(np.array(fitted.ends()))
-        label = with_unit(name.replace("_", " "), result.record.unit_of(path, units.get(name, "rad")))
-        inside = [] if fitted is None else [fitted.value]
-        panels.append(Panel(TIME, Axis(label, ends=limits(*ends, share=0.02, room=0.25, inside=inside)), parts))
-    return stack(
-        "recursive",
-        panels,
-        "The paper's recursive identification (27)-(28) on the equivalent control of both sides, and the trajectory fit "
-        "with its interval. The scale is that of the second half of the record.",
-        2.1,
     )

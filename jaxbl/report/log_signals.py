@@ -1,7 +1,6 @@
 """Signals that the figures of `jaxbl identify` compare: the log, its observers and the fitted model."""
 
 import dataclasses
-from collections.abc import Iterator
 from functools import cached_property
 
 import jax
@@ -10,14 +9,11 @@ import numpy as np
 
 from jaxbl.estimation.identify import Identification
 from jaxbl.records import POSITION_CHANNELS
-from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards
 from jaxbl.records.signal_quality import longest_segment
 
-from .panels import SIDES, Array, Pair
+from .panels import SIDES, Array
 
-_CYCLES = 2.5
-"""Cycles of motion shown in detail: one whole cycle is always among them."""
 _SETTLING = 0.1
 """Share of the record left to the observers to converge: shown, but not in rms values and scales."""
 
@@ -41,9 +37,8 @@ class LogSignals:
         channels = self.record.statistics.channels
         self.unit = {side: channels[POSITION_CHANNELS[side]].unit for side in self.sides}
         self.torque_unit = "N" if self.unit["motor"] == "m" else "N m"
-        self.experiment = found.model.build()
-        self.plant = self.experiment.plant
-        self.time_constant = float(self.experiment.equivalent_control.time_constant)
+        experiment = found.model.build()
+        self.plant, self.time_constant = experiment.plant, float(experiment.equivalent_control.time_constant)
         self.observed = longest_segment(self.record.segments)
         first, last = self.observed.start, self.observed.stop
         self.settled = slice(first + int(_SETTLING * (last - first)), last)
@@ -51,38 +46,6 @@ class LogSignals:
     def __getitem__(self, name: str) -> Array:
         """A column of the trace."""
         return self.trace[name].to_numpy(dtype=float)
-
-    @cached_property
-    def detail(self) -> slice:
-        """A few cycles where the motion is largest; all of the observed part where that is hardly longer."""
-        rows, period = self.settled, self.record.sample_period
-        velocity = self["motor.velocity"][rows]
-        count = len(velocity)
-        away = velocity[np.abs(velocity) > 0.1 * np.max(np.abs(velocity), initial=0.0)]
-        reversals = int(np.count_nonzero(np.diff(np.sign(away))))
-        length = int(_CYCLES * 2.0 * len(away) / reversals) if reversals > 2 else count // 4
-        length = max(length, 200, round(20.0 * self.time_constant / period))
-        if 1.5 * length > count:
-            return self.observed
-        sums = (np.cumsum(np.r_[0.0, velocity**power]) for power in (1, 2))
-        mean, square = ((total[length:] - total[:-length]) / length for total in sums)
-        start = rows.start + int(np.argmax(square - mean**2))
-        return slice(start, start + length)
-
-    @property
-    def whole(self) -> bool:
-        """True if the part shown in detail is the whole observed part."""
-        return self.detail == self.observed
-
-    @property
-    def line(self) -> slice:
-        """The rows drawn as a line over the other points: the part shown in detail, without the observers' beginning."""
-        return self.settled if self.whole else self.detail
-
-    @cached_property
-    def span(self) -> Pair:
-        """Begin and end of the part shown in detail, s."""
-        return float(self.time[self.detail][0]), float(self.time[self.detail][-1])
 
     def low_passed(self, values: Array) -> Array:
         """Values behind the low-pass of the equivalent control, for the same lag; NaN outside the observed part."""
@@ -132,16 +95,3 @@ class LogSignals:
     def measured_torque(self) -> Array | None:
         """Measured transmitted torque, low-passed like the observed one."""
         return self.low_passed(self["transmitted"]) if "transmitted" in self.trace else None
-
-    def parts(self, rows: slice | None = None) -> Iterator[slice]:
-        """Contiguous parts of some rows."""
-        for segment in self.record.segments:
-            part = segment if rows is None else slice(max(segment.start, rows.start), min(segment.stop, rows.stop))
-            if part.start < part.stop:
-                yield part
-
-    def rms(self, values: Array) -> float:
-        """Root mean square of the finite values of the settled part; NaN if there is none."""
-        part = values[self.settled]
-        finite = part[np.isfinite(part)]
-        return rms(finite) if len(finite) else float("nan")

@@ -15,14 +15,16 @@ from jaxbl.config import read_config
 from jaxbl.estimation.identify import Identification
 from jaxbl.estimation.regression import Kinematics, model_torques
 from jaxbl.records import read_record
+from jaxbl.records.least_squares import rms
 from jaxbl.report.drawing import save
 from jaxbl.report.identify import describe_identification
 from jaxbl.report.identify_figures import draw_identification
+from jaxbl.report.log_signals import LogSignals
 from jaxbl.report.results import write_report
 from jaxbl.sweeps.trial import run
 
-GEARED = ["hysteresis", "intervals", "residuals", "torque", "limit_cycle", "velocities", "recursive"]
-RIGID = ["friction", "intervals", "residuals", "resistance", "velocities"]
+GEARED = ["hysteresis", "intervals", "residuals"]
+RIGID = ["friction", "intervals", "residuals"]
 MOTION = {
     "excitation": {"kind": "multisine", "amplitude": 5.0, "frequency": 0.5},
     "observer": {"motor": {"lambda": 20.0, "alpha": 400.0}, "load": {"lambda": 3.0, "alpha": 20.0}},
@@ -151,9 +153,8 @@ def test_all_figures_are_drawn_with_units(case, tmp_path):
             "by the load side",
             "measured",
         ]
-        assert "measured" in names_of(panels["torque"][0])
     if case == "shaft":
-        assert not any("gap" in text for text in names_of(panels["limit_cycle"][0]))
+        assert not any("gap" in text for text in names_of(panels["hysteresis"][0]))
     if case == "effects":
         assert any("half width 0.09" in text for text in names_of(panels["hysteresis"][0]))
     if case == "gap":
@@ -174,8 +175,9 @@ def test_a_linear_axis_has_newtons_and_metres(tmp_path):
     assert ("0.1500 ± 0.0010 N s/m", "drive.motor_viscous") in described.key_figures
     assert "motor: 0.0001 m rms" in described.headline
     drawings = draw_by_name(result)
-    assert drawings["velocities"].panels[0].y.label == "motor velocity (m/s)"
-    assert drawings["resistance"].panels[0].y.label == "resisting force (N)"
+    (panel,) = drawings["friction"].panels
+    assert panel.x.label == "velocity by the smoother (m/s)"
+    assert panel.y.label == "resisting force (N)"
     assert "kg m²" not in (tmp_path / "report.html").read_text()
 
 
@@ -183,25 +185,13 @@ def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     """Friction of 1 N m on the motor and 5 N m on the load is not mistaken for transmitted torque."""
     friction = [{"kind": "motor.coulomb_friction", "torque": 1.0}, {"kind": "load.coulomb_friction", "torque": 5.0}]
     result = make_identification(geared_study({"run.duration": 2.0}, effects=friction), tmp_path)
-    _, below = draw_by_name(result)["torque"].panels
-    rms = [float(text.split("rms ")[1].split()[0]) for text in names_of(below)]
-    assert len(rms) == 2
     bare_result = dataclasses.replace(result, trace=result.trace.drop(columns=["motor.effects", "load.effects"]))
-    _, below = draw_by_name(bare_result)["torque"].panels
-    rms_without = [float(text.split("rms ")[1].split()[0]) for text in names_of(below)]
-    assert min(rms) < 0.6 * min(rms_without)
-
-
-def test_long_log_shows_its_largest_motion_in_full(tmp_path):
-    """Small motion, then large motion in the third quarter."""
-    result = make_identification(geared_study({"run.duration": 10.0}), tmp_path)
-    trace = result.trace.copy()
-    size = np.where((trace["t"] > 6.0) & (trace["t"] < 8.0), 1.0, 0.1)
-    trace["motor.velocity"] *= size
-    above, below = draw_by_name(dataclasses.replace(result, trace=trace))["velocities"].panels[::2]
-    low, high = above.x.ends
-    assert 5.9 < low < high < 8.1
-    assert below.x.ends == pytest.approx((0.0, 10.0), abs=0.01)
+    errors = []
+    for found in (result, bare_result):
+        log = LogSignals(found)
+        law = log.low_passed(log["torque"])
+        errors.append(min(rms((torque - law)[log.settled]) for torque in log.torques.values()))
+    assert errors[0] < 0.6 * errors[1]
 
 
 @pytest.mark.usefixtures("every_figure_drawn")
@@ -221,19 +211,6 @@ def test_gains_of_which_none_follows_the_log_are_not_called_chosen(tmp_path):
     gains = {"motor": {"lambda_": 70.0, "alpha": 4600.0, "f_plus": 4200.0, "velocity_error": None}}
     lines = write_report(dataclasses.replace(result, summary=result.summary | {"gains": gains}), tmp_path).details
     assert [line.startswith("motor observer: no gains") for line in lines if "observer: " in line] == [True]
-
-
-@pytest.mark.parametrize("factor", [0.5, 1.0, 1.1])
-def test_the_fitted_line_is_shown_wherever_the_recursive_numbers_end(factor, tmp_path):
-    result = make_identification(geared_study(), tmp_path)
-    trace = result.trace.copy()
-    for side in ("motor", "load"):
-        trace[f"{side}.half_gap"] = factor * 0.08 + 1e-6 * np.sin(np.arange(len(trace)))
-    figure = draw_by_name(dataclasses.replace(result, trace=trace))["recursive"]
-    low, high = figure.panels[1].y.ends
-    margin = 0.1 * (high - low)
-    assert low + margin < 0.08 < high - margin
-    save(figure, tmp_path / "recursive.png")
 
 
 @pytest.mark.parametrize(("factor", "doubtful"), [(1000.0, True), (1.5, False)])
