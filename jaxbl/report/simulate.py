@@ -1,11 +1,10 @@
-"""What `jaxbl simulate` leaves to be read. The figures are the analogues of Figs. 7 to 17, 28 and 29 of the paper."""
+"""What `jaxbl simulate` leaves to be read. The figures are analogues of figures of the paper."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-from pandas import DataFrame
+from pandas import DataFrame, Series
 
-from jaxbl.drive.parameters import units_of
 from jaxbl.files import write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
@@ -15,7 +14,6 @@ from .error_plane import error_plane
 from .gain_plane import conditions_line, draw_gain_plane
 from .panels import (
     BLACK,
-    BLUE,
     SIDE_COLOURS,
     SIDES,
     TIME,
@@ -25,10 +23,8 @@ from .panels import (
     Figure,
     Line,
     Panel,
-    Span,
     cloud,
     stack,
-    with_unit,
 )
 
 
@@ -74,125 +70,74 @@ def describe_trial(trial: Trial) -> Result:
         for name, metric in SIDE_METRICS.items()
         if f"motor.{name}" in metrics
     ]
-    tables, remarks = [ResultTable("Metrics", ["", *sides, "unit", "meaning"], rows)], []
+    tables = [ResultTable("Metrics", ["", *sides, "unit", "meaning"], rows)]
     if identified := summary["identified"]:
         rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
         tables.insert(0, ResultTable("Identified", ["", "true", *sides], rows))
-        for name, true, *values in rows:
-            texts = ("undetermined" if value is None else f"{value:.4g}" for value in values)
-            pairs = ", ".join(f"{text} ({side})" for text, side in zip(texts, sides, strict=True))
-            remarks.append(f"{name}: {pairs}; true {true:.4g}")
     judged = summary["conditions"].items()
-    remarks += [conditions_line(side, gains, "the true bound along this run") for side, gains in judged]
+    remarks = [conditions_line(side, gains, "the true bound along this run") for side, gains in judged]
     title = trial.config.title or "Run"
     return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
 def draw_trial(trial: Trial) -> list[Figure]:
     """All figures of a run."""
-    trace = trial.trace
+    trace, controller = trial.trace, trial.config.controller
     sides = [side for side in SIDES if f"{side}.position" in trace]
-    figures = [_torque(trace, sides)]
-    figures += [_draw_observer(trace, side, quantity) for side in sides for quantity in ("velocity", "position")]
-    panel = Panel(TIME, Axis("input torque u (N m)"), [Line(trace["t"], trace["u"])])
-    figures.append(Figure("input", [panel], "Input torque (analogue of Fig. 7).", height=2.4))
-    if trial.config.controller is not None:
-        figures.append(_draw_following(trace, trial.config.controller.side))
+    name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
+    estimates = {f"from the {side} observer": (trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]) for side in sides}
+    caption = f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16)."
+    figures = [_compare("torque", trace, name, "N m", ("true", trace["torque"]), estimates, caption)]
+    for side in sides:
+        true, estimate = (trace[f"{side}.velocity{end}"] for end in ("", "_estimate"))
+        caption = f"{side.capitalize()} velocity, true and observed, and the error (analogue of Figs. {_FIGURES[side]})."
+        observed = {"observer": (estimate, VERMILION)}
+        figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", ("true", true), observed, caption))
+    if controller is not None:
+        target, position = ("reference", trace["reference"]), trace[f"{controller.side}.position"]
+        caption = f"{controller.side.capitalize()} position, the reference that it is to follow, and the error."
+        name = f"{controller.side} position"
+        figures.append(_compare("following", trace, name, "rad", target, {"true": (position, VERMILION)}, caption))
     judged = trial.summary["conditions"]
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     figures += [error_plane(trace, side, gains) for side, gains in judged.items()]
-    if len(sides) == 2:
-        last = DataFrame(trace[trace["t"] > 0.5 * trace["t"].iloc[-1]])
-        figures += [_draw_identified(trial, last), _hysteresis(last), _limit_cycle(last)]
-    return figures
+    return [*figures, _hysteresis(trace)] if len(sides) == 2 else figures
 
 
-_FIGURES = {"motor.velocity": "8-9", "motor.position": "10-11", "load.velocity": "12-13", "load.position": "14-15"}
-_UNITS = {"velocity": "rad/s", "position": "rad"}
+_FIGURES = {"motor": "8-9", "load": "12-13"}
 
 
-def _draw_observer(trace: DataFrame, side: str, quantity: str) -> Figure:
-    name, unit = f"{side}.{quantity}", _UNITS[quantity]
-    time, true, estimate = (trace[column] for column in ("t", name, f"{name}_estimate"))
-    lines = [Line(time, estimate, "observer", VERMILION, 2.4, opacity=0.8), Line(time, true, "true", width=1.0)]
+def _compare(
+    name: str,
+    trace: DataFrame,
+    quantity: str,
+    unit: str,
+    reference: tuple[str, Series],
+    estimates: Mapping[str, tuple[Series, str]],
+    caption: str,
+) -> Figure:
+    """A signal with what follows it, each with its colour, over time, and below by how much these are off."""
+    (label, true), time = reference, trace["t"]
+    above = [Line(time, values, key, colour, 2.0, opacity=0.75) for key, (values, colour) in estimates.items()]
+    below = [line._replace(y=true - line.y, name="", width=1.0) for line in above]
     panels = [
-        Panel(TIME, Axis(f"{side} {quantity} ({unit})"), lines),
-        Panel(TIME, Axis(f"error ({unit})"), [ZERO, Line(time, true - estimate, colour=BLUE)]),
+        Panel(TIME, Axis(f"{quantity} ({unit})"), [*above, Line(time, true, label, width=1.0)]),
+        Panel(TIME, Axis(f"error ({unit})"), [ZERO, *below]),
     ]
-    caption = f"{side.capitalize()} {quantity}, true and observed, and the error (analogue of Figs. {_FIGURES[name]})."
-    return stack(f"{side}_{quantity}", panels, caption)
+    return stack(name, panels, caption)
 
 
-def _draw_following(trace: DataFrame, side: str) -> Figure:
-    time, target, true = trace["t"], trace["reference"], trace[f"{side}.position"]
-    lines = [Line(time, target, "reference", VERMILION, 2.4, opacity=0.8), Line(time, true, "true", width=1.0)]
-    panels = [
-        Panel(TIME, Axis(f"{side} position (rad)"), lines),
-        Panel(TIME, Axis("following error (rad)"), [ZERO, Line(time, target - true, colour=BLUE)]),
-    ]
-    return stack("following", panels, f"{side.capitalize()} position, the reference that it is to follow, and the error.")
-
-
-def _torque(trace: DataFrame, sides: list[str]) -> Figure:
-    time, torque = trace["t"], trace["torque"]
-    above = [
-        Line(time, trace[f"{side}.torque_estimate"], f"from the {side} observer", SIDE_COLOURS[side], 2.0, opacity=0.75)
-        for side in sides
-    ]
-    below = [line._replace(y=torque - line.y, name="", width=1.0) for line in above]
-    name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
-    panels = [
-        Panel(TIME, Axis(f"{name} (N m)"), [*above, Line(time, torque, "true", width=1.0)]),
-        Panel(TIME, Axis("error (N m)"), [ZERO, *below]),
-    ]
-    return stack("torque", panels, f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16).")
-
-
-def _draw_identified(trial: Trial, last: DataFrame) -> Figure:
-    trace, panels = trial.trace, []
-    # what a law derives from its own parameters is an angle, as they are
-    units = units_of(trial.config.build().transmission)
-    for name, values in trial.summary["identified"].items():
-        true = values["true"]
-        lines = [Line(trace["t"], trace[f"{side}.{name}"], f"{side} identifier", SIDE_COLOURS[side]) for side in SIDES]
-        # the estimates of the first half still converge: the second half sets the scale
-        largest = float((last[[f"{side}.{name}" for side in SIDES]] - true).abs().max(axis=None))
-        reach = max(2.0 * largest if np.isfinite(largest) else 0.0, 0.02 * abs(true), 1e-12)
-        axis = Axis(with_unit(name.replace("_", " "), units.get(name, "rad")), ends=(true - reach, true + reach))
-        panels.append(Panel(TIME, axis, [*lines, Span(true, true, "true", along="y")]))
-    return stack("dead_zone", panels, "Identified transmission parameters over time (27)-(28) (analogue of Fig. 16).")
-
-
-def _hysteresis(last: DataFrame) -> Figure:
-    twist = last["z"]
+def _hysteresis(trace: DataFrame) -> Figure:
+    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
     loops = [
-        Line(twist, last[f"{side}.torque_estimate"], f"by the {side} observer", SIDE_COLOURS[side], 1.6, opacity=0.75)
+        Line(last["z"], last[f"{side}.torque_estimate"], f"by the {side} observer", SIDE_COLOURS[side], 1.6, opacity=0.75)
         for side in SIDES
     ]
-    loops.append(cloud(twist, last["torque"], "true", BLACK, opacity=1.0))
-    positions = [
-        Line(last["theta_e"], last["theta_s"], "measured", VERMILION, 1.8),
-        Line(last["motor.position_estimate"], last["load.position_estimate"], "observed", width=0.8),
-    ]
-    panels = [
-        Panel(Axis("twist z = θe − N₀ θs (rad)"), Axis("transmitted torque C (N m)"), loops),
-        Panel(Axis("motor position θe (rad)"), Axis("load position θs (rad)"), positions),
-    ]
+    loops.append(cloud(last["z"], last["torque"], "true", BLACK, opacity=1.0))
     caption = (
-        "Torque over twist (chatter and lag of the estimates widen the loop), and load over motor position. Second half of "
-        "the run (analogue of Fig. 17)."
+        "Torque over twist in the second half of the run; chatter and lag of the estimates widen the loop (analogue of "
+        "Fig. 17)."
     )
-    return Figure("hysteresis", panels, caption, columns=2)
-
-
-def _limit_cycle(last: DataFrame) -> Figure:
-    panels = []
-    for side, angle in zip(SIDES, ("θe", "θs"), strict=True):
-        looks = {"_estimate": ("observed", VERMILION, 2.2, 0.8), "": ("true", BLACK, 0.9, 1.0)}
-        lines = [
-            Line(last[f"{side}.position{end}"], last[f"{side}.velocity{end}"], name, colour, width, opacity=opacity)
-            for end, (name, colour, width, opacity) in looks.items()
-        ]
-        panels.append(Panel(Axis(f"{side} position {angle} (rad)"), Axis(f"{side} velocity (rad/s)"), lines))
-    caption = "Velocity over position, second half of the run: the limit cycle (cf. Fig. 28)."
-    return Figure("limit_cycle", panels, caption, columns=2)
+    return Figure(
+        "hysteresis", [Panel(Axis("twist z = θe − N₀ θs (rad)"), Axis("transmitted torque C (N m)"), loops)], caption
+    )
