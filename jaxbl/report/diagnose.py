@@ -17,27 +17,17 @@ from .motor_alone_figures import draw_motor_alone
 from .numbers import lead_with_doubt, number_table, write_fit
 from .panels import (
     BLUE,
-    FAINT,
-    MISSING,
     ORANGE,
     TIME,
     VERMILION,
-    ZERO,
     Axis,
-    Band,
-    Bars,
     Figure,
-    Line,
     Panel,
     Span,
     missing_label,
-    missing_quantity,
-    name_rows,
-    place_words,
     stack,
-    with_unit,
 )
-from .residuals import draw_residuals, torque_parts
+from .residuals import draw_residual, torque_parts
 
 _BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
@@ -402,87 +392,11 @@ def _limits(gap: JsonObject) -> dict[str, float | None]:
 def draw_diagnosis(diagnosis: Diagnosis) -> list[Figure]:
     """All figures of a diagnosis."""
     if not diagnosis.located:
-        return [_draw_gap(diagnosis.summary), *draw_motor_alone(diagnosis)]
+        return [draw_motor_alone(diagnosis)]
     unit = diagnosis.record.unit_of("motor.torque", "N m")
-    residuals = draw_residuals(diagnosis.residuals, diagnosis.coordinates, diagnosis.located, unit, diagnosis.observed)
-    tables = [_tables(diagnosis)] if "torque_tables" in diagnosis.summary else []
-    return [_over_time(diagnosis), _draw_gap(diagnosis.summary), *tables, *residuals]
-
-
-def _tables(diagnosis: Diagnosis) -> Figure:
-    """Torques without a name, over position and speed, with their standard errors."""
-    panels = []
-    for side, tables in diagnosis.summary["torque_tables"]["tables"].items():
-        force = diagnosis.record.unit_of(f"{side}.torque", "N m")
-        for table in tables:
-            kind = "velocity" if table["over"] == "speed" else "position"
-            points, torques, errors = (np.array(table[key]) for key in ("points", "torques", "errors"))
-            unit = diagnosis.record.unit_of(f"{side}.{kind}", "rad/s" if kind == "velocity" else "rad")
-            band = Band(points, torques - 2.0 * errors, torques + 2.0 * errors, "", FAINT, 0.35)
-            x = Axis(with_unit(f"{side} {_OVER[table['over']]}", unit))
-            y = Axis(with_unit(f"{side}: resisting {missing_quantity(force)}", force))
-            panels.append(Panel(x, y, [ZERO, band, Line(points, torques, colour=_AFTER, marker="o", size=4.0)]))
-    caption = (
-        "What none of the known effects explains, as tables in model.toml: the torque that resists motion "
-        "beside the named effects. Band: two standard errors. Held-out data are predicted better with it."
-    )
-    return Figure("torque_tables", panels, caption, len(panels), max(3.4 * len(panels), 5.0))
-
-
-def _draw_gap(summary: JsonObject) -> Figure:
-    """Each channel's error over its noise, before and after, with the control; and the probability of each effect."""
-    gap, candidates = summary["gap"], _candidates(summary)
-    height = max(0.55 * len(gap["holdout_rmse_before"]) + 1.2, 0.42 * len(candidates) + 1.2)
-    caption = (
-        f"{_verdict(summary)[1]} Left: rms error on held-out data over the channel's noise; lines lead from the model "
-        "as given to the model with the missing effects. Black line: noise; strokes: the most that noise, the uncertainty "
-        "of the numbers and torques too small to be named leave of a complete model. Control, which must do worse: "
-        "another effect at its best. Right: probability of each effect, and of those "
-        "that this log does not rule out instead."
-    )
-    panels = [_gap_panel(gap), _chances_panel(candidates)]
-    return Figure("gap", panels, caption, 2, 10.4, height, widths=(2.0, 1.0))
-
-
-def _gap_panel(gap: JsonObject) -> Panel:
-    names = list(gap["holdout_rmse_before"])
-    floor, rows = np.array([gap["noise_floor"][name] for name in names]), np.arange(len(names))
-
-    def over(errors: Mapping[str, float | None]) -> np.ndarray:
-        return np.array([errors.get(name) for name in names], float) / floor
-
-    before, after, most = map(over, (gap["holdout_rmse_before"], gap["holdout_rmse_after"], _limits(gap)))
-    ways = np.stack([before, after, np.full(len(names), np.nan)], axis=1).ravel()
-    parts = [
-        Line(ways, np.repeat(rows, 3), colour=FAINT, width=1.2),
-        Line(before, rows, "before", _BEFORE, 0.0, marker="D", size=7.0),
-        Line(after, rows, "after", _AFTER, 0.0, marker="o", size=7.0),
-        Span(1.0, 1.0, "noise", width=1.6, dashes="-"),
-        Line(most, rows, "a complete model at most", width=0.0, marker="|", size=16.0),
-    ]
-    values = [before, after, most]
-    if control := gap["controls"].get("wrong"):
-        values.append(over(control["rmse"]))
-        parts.append(Line(values[-1], rows + 0.24, f"control: {control['effect']}", FAINT, 0.0, marker="x", size=7.0))
-    drawn = np.concatenate(values)
-    drawn = drawn[np.isfinite(drawn) & (drawn > 0.0)]
-    ends = 0.5 * min(float(drawn.min(initial=1.0)), 1.0), 2.0 * max(float(drawn.max(initial=1.0)), 3.0)
-    labels = [
-        f"{_CHANNELS[name]}\n{rms_text(start)} → {rms_text(gap['holdout_rmse_after'][name])} {gap['units'][name]}"
-        for name, start in gap["holdout_rmse_before"].items()
-    ]
-    return Panel(Axis("rms error on held-out data over noise", log=True, ends=ends), name_rows(labels), parts)
-
-
-def _chances_panel(candidates: list[tuple[str, JsonObject, bool]]) -> Panel:
-    bars = [
-        Bars([row], [effect["confidence"]], colour=_AFTER if is_found else MISSING, thickness=0.3)
-        for row, (_, effect, is_found) in enumerate(candidates)
-    ]
-    texts = [f"{name}: {probability(effect['confidence'])}" for name, effect, _ in candidates]
-    names = place_words([0.0] * len(texts), np.arange(len(texts)) - 0.36, texts)
-    y = Axis(ends=(max(len(candidates), 3) - 0.4, -0.8), names=((-9.0, ""),))
-    return Panel(Axis("confidence", ends=(0.0, 1.0)), y, [*bars, names], note="" if candidates else "no effect named")
+    residuals = diagnosis.residuals.items()
+    over = [draw_residual(parts, diagnosis.coordinates[side], diagnosis.located[side], unit) for side, parts in residuals]
+    return [_over_time(diagnosis), *over]
 
 
 def _over_time(diagnosis: Diagnosis) -> Figure:

@@ -39,7 +39,7 @@ def draw_identification(result: Identification) -> list[Figure]:
     """All figures of an identification."""
     log = LogSignals(result)
     if "backlash" in result.summary:
-        return [_intervals(result), *draw_motor_alone(result), _residuals(log)]
+        return [_intervals(result), draw_motor_alone(result), _residuals(log)]
     first = _hysteresis if log.geared else _friction
     return [first(log), _intervals(result), _residuals(log)]
 

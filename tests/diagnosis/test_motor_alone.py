@@ -42,7 +42,7 @@ def test_a_gap_and_frictions_are_named_and_proved(tmp_path):
     assert any(line.startswith("No load position") for line in lines)
     assert any("predicted one sample ahead" in line for line in lines)
     assert json.loads((tmp_path / "diagnosis.json").read_text())["backlash"]["shown"]
-    assert {file.name for file in (tmp_path / "figures").iterdir()} == {"gap.png", "half_gaps.png", "hysteresis.png"}
+    assert {file.name for file in (tmp_path / "figures").iterdir()} == {"hysteresis.png"}
     assert {effect.kind for effect in diagnosis.model.effects} == set(numbers)
 
 

@@ -6,11 +6,11 @@ import dataclasses
 import numpy as np
 import pytest
 from hidden.outcomes import FIRST_LINE
-from panel_parts import names_of, texts_of
+from panel_parts import names_of
 from passed import PASSED
 
 from jaxbl.diagnosis.residuals import Residual
-from jaxbl.report.diagnose import _draw_gap, _over_time, describe_diagnosis
+from jaxbl.report.diagnose import _over_time, describe_diagnosis
 from jaxbl.report.drawing import save
 
 ERRORS = {
@@ -219,17 +219,6 @@ def test_a_torque_that_is_far_off_comes_first(relative, doubtful):
     result = describe_diagnosis(change_summary(findings=[finding]))
     assert result.headline.startswith("the torque would be 0.02 times what u says: a unit,") is doubtful
     assert result.verdict == ("doubtful" if doubtful else "good")
-
-
-@pytest.mark.parametrize("findings", [SUMMARY["findings"], []], ids=["some", "none"])
-def test_the_verdict_is_drawn(findings, tmp_path):
-    drawing = _draw_gap(change_summary(findings=findings, verdict="explained" if findings else "no_discrepancy"))
-    left, right = drawing.panels
-    assert left.x.label == "rms error on held-out data over noise" and left.x.log
-    assert left.y.names[0] == (0, "motor position\n0.1 → 0.0011 rad")
-    assert texts_of(right) == (["load.coulomb_friction: 0.93", "or load.stribeck_friction: 0.07"] if findings else [])
-    assert right.note == ("" if findings else "no effect named")
-    assert save(drawing, tmp_path / "gap.png").stat().st_size > 10_000
 
 
 @dataclasses.dataclass

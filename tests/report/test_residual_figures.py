@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from panel_parts import names_of, part_named, texts_of
 
 from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.localise import locate
-from jaxbl.diagnosis.observer_residual import Observed
 from jaxbl.diagnosis.residuals import Residual
 from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.report.drawing import save
-from jaxbl.report.residuals import draw_residuals
+from jaxbl.report.residuals import draw_residual
 
 
 def make_residual(name, torque, time):
@@ -26,21 +24,6 @@ def make_residual(name, torque, time):
     return residual, values
 
 
-def test_observers_that_converge_are_drawn_thin(tmp_path):
-    time = 5e-3 * np.arange(4000)
-    torque = {name: -0.1 * np.sign(np.cos(time)) for name in ("motor", "load")}
-    pairs = {name: make_residual(name, side_torque, time) for name, side_torque in torque.items()}
-    residuals, coordinates = ({name: [pair[i]] for name, pair in pairs.items()} for i in range(2))
-    result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
-    observed = {name: [Observed(pair[0], 0, 0.5 * (name == "load"))] for name, pair in pairs.items()}
-    drawing = draw_residuals(residuals, coordinates, result, observed=observed)[0]
-    above, below = map(names_of, drawing.panels)
-    assert above[:2] == below == ["± 2 noise", "missing"] and len(above) == 3
-    assert above[2].startswith("by its observer (noise 0.0") and "super-twisting" in drawing.caption
-    assert part_named(drawing.panels[0], "by its").width < part_named(drawing.panels[0], "missing").width
-    assert save(drawing, tmp_path / "over_time.png").stat().st_size > 10_000
-
-
 @pytest.mark.parametrize("unit", ["N m", "N"])
 def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     time = 5e-3 * np.arange(8000)
@@ -49,14 +32,13 @@ def test_every_equation_is_drawn_with_what_was_found(tmp_path, unit):
     residuals = {name: [residual] for name, (residual, _) in pairs.items()}
     coordinates = {name: [values] for name, (_, values) in pairs.items()}
     result = {name: locate(residuals[name], coordinates[name]) for name in pairs}
-    drawings = {drawing.name: drawing for drawing in draw_residuals(residuals, coordinates, result, unit)}
-    assert list(drawings) == ["residual_torque", "residual_motor", "residual_load", "residual_spectrum"]
-    above, below = drawings["residual_torque"].panels
-    assert sentence_of(result["motor"], unit) == " ".join(above.title.split())
-    assert "nothing beyond noise" in below.title
-    assert above.y.label.endswith(f"({unit})")
-    assert drawings["residual_motor"].panels[0].x.label == "speed ω (rad/s)"
-    assert any(text.startswith("11 Hz") for text in texts_of(drawings["residual_spectrum"].panels[0]))
-    for drawing in drawings.values():
+    drawings = [draw_residual(residuals[name], coordinates[name], result[name], unit) for name in pairs]
+    assert [drawing.name for drawing in drawings] == ["residual_motor", "residual_load"]
+    above, below = drawings
+    assert above.caption.lower().startswith(sentence_of(result["motor"], unit).lower())
+    assert "nothing beyond noise" in below.caption
+    assert above.panels[0].y.label.endswith(f"({unit})")
+    assert above.panels[0].x.label == "speed ω (rad/s)"
+    for drawing in drawings:
         assert save(drawing, tmp_path / f"{drawing.name}.png").stat().st_size > 10_000
         assert drawing.caption.endswith(".")
