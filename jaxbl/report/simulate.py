@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from pandas import DataFrame, Series
+from pandas import DataFrame
 
 from jaxbl.files import write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -112,8 +113,8 @@ def _compare(
     trace: DataFrame,
     quantity: str,
     unit: str,
-    reference: tuple[str, Series],
-    estimates: Mapping[str, tuple[Series, str]],
+    reference: tuple[str, Any],
+    estimates: Mapping[str, tuple[Any, str]],
     caption: str,
 ) -> Figure:
     """A signal with what follows it, each with its colour, over time, and below by how much these are off."""
@@ -128,7 +129,7 @@ def _compare(
 
 
 def _hysteresis(trace: DataFrame) -> Figure:
-    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+    last: Any = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
     loops = [
         Line(last["z"], last[f"{side}.torque_estimate"], f"by the {side} observer", SIDE_COLOURS[side], 1.6, opacity=0.75)
         for side in SIDES
