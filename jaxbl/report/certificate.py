@@ -7,8 +7,6 @@ from jaxbl.files import write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.result import ResultTable
 
-from .panels import BLUE, VERMILION, Axis, Figure, Line, Panel, Span
-
 ASSUMPTIONS = (
     "The acceleration of the shaft less the nominal one that the observer takes for a period (unknown torque over inertia, "
     "and what friction makes of the velocity error) stays within ±f_plus at all times; it may change at any time.",
@@ -108,26 +106,3 @@ def certificate_tables(summary: JsonObject) -> list[ResultTable]:
     columns, rows = ["", *certificates], list(zip(names, *sides, strict=True))
     table = ResultTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
     return [table, ResultTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
-
-
-def draw_certificates(summary: JsonObject) -> list[Figure]:
-    """The proven bound over time on each side, and the worst that was found."""
-    return [_bounds(side, proof) for side, proof in _proven(summary).items()]
-
-
-def _bounds(side: str, proof: JsonObject) -> Figure:
-    (time, bound), start = (proof["curve"][name] for name in ("time", "bound")), proof["reaching_time"]
-    worst = proof["search"]["worst"]
-    # beyond its last point the bound stays as it is
-    end = max(1.3 * start, time[-1], 20.0 * proof["assumptions"]["period"])
-    parts = [
-        Line([*time, end], [*bound, bound[-1]], "proven bound", BLUE, steps=True),
-        Span(worst, worst, "worst found, from rest", VERMILION, "y"),
-        Line([start], [proof["accuracy"]], "proven from here on", BLUE, 0.0, marker="o", size=7.0),
-    ]
-    caption = (
-        f"{side}: bound of the error of the estimated velocity, whatever noise and missing acceleration do within what is "
-        f"assumed, and the worst of {proof['search']['runs']} adversarial runs."
-    )
-    panel = Panel(Axis("time (s)", ends=(0.0, end)), Axis("velocity error (rad/s)", log=True), parts, f"{side} observer")
-    return Figure(f"certificate_{side}", [panel], caption)

@@ -1,6 +1,6 @@
-"""What `jaxbl tune` leaves to be read: the objective over the gains, error over convergence time, comparisons."""
+"""What `jaxbl tune` leaves to be read: the objective over the gains, what limits them, comparisons."""
 
-from itertools import cycle, product
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxbl.lines import Lines, doubts_among, percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .certificate import certificate_lines, certificate_tables, draw_certificates, is_refuted, write_certificates
+from .certificate import certificate_lines, certificate_tables, is_refuted, write_certificates
 from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usual_rule_curve
 from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
@@ -23,14 +23,9 @@ from .panels import (
     BLUE,
     GREEN,
     MARKERS,
-    MISSING,
     ORANGE,
     SIDES,
-    SKY,
-    VERMILION,
-    Array,
     Axis,
-    Bars,
     Figure,
     Line,
     Map,
@@ -39,8 +34,6 @@ from .panels import (
     Span,
     literal,
     mark,
-    name_rows,
-    place_words,
     stretches,
     with_unit,
 )
@@ -48,10 +41,7 @@ from .panels import (
 
 def draw_tuning(tuning: Tuning) -> list[Figure]:
     """All figures of a tuning."""
-    sides = [side for side in SIDES if side in tuning.candidates]
-    maps = [draw(tuning, side) for side in sides for draw in (_map, _limits)]
-    fronts = [_front(tuning, side) for side in sides]
-    return [*maps, *fronts, _comparison(tuning.summary, sides), *draw_certificates(tuning.summary)]
+    return [draw(tuning, side) for side in SIDES if side in tuning.candidates for draw in (_map, _limits)]
 
 
 def error_label(summary: JsonObject) -> str:
@@ -191,77 +181,6 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     cause = {"chatter": ", as its chatter grows", "slow": ", as its slow part grows", None: ""}[way["by"]]
     joint = "but" if way["limit"] == "constraint" else "and"
     return f"error {_size(way['change'])} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
-
-
-def _front(tuning: Tuning, side: str) -> Figure:
-    summary, data = tuning.summary, (tuning.candidates[side].query("feasible"), DataFrame(tuning.summary["pareto"][side]))
-    feasible, front = (Line(table["convergence_time"], table["error"], size=3.5) for table in data)
-    parts = [
-        feasible._replace(name="gains that meet all constraints", colour=MISSING, width=0.0, marker="."),
-        front._replace(name="none better in both", colour=BLUE, marker="o", steps=True),
-    ]
-    keys, margins = ("convergence_time", f"{summary['objective']}_rmse"), summary["margins"]
-    for name, marker, row in _compared_gains(summary, side):
-        x, y = (row[key]["worst"] for key in keys)
-        if x is None or y is None:
-            parts.append(Line([], [], f"{name}: {100 * row['converged']:.3g} % converge", width=0.0))
-            continue
-        met = all(row[f"margin_{key}"] >= margin for key, margin in margins.items())
-        parts.append(mark(x, y, name if met else f"{name}, margins not met", marker, 8.0, held=False))
-    x, y = (summary["achieved"][side][key] for key in keys)
-    parts.append(mark(x, y, "tuned", held=False))
-    x_axis, y_axis = (
-        Axis(label, log=_spans_decade(np.concatenate([np.asarray(part[i], float) for part in parts])))
-        for i, label in enumerate(("worst convergence time (s)", f"worst {error_label(summary)}"))
-    )
-    caption = f"{side}: error against convergence time, each the worst of all runs on the study's excitation."
-    return Figure(f"pareto_{side}", [Panel(x_axis, y_axis, parts, side)], caption, width=5.6)
-
-
-def _spans_decade(values: Array) -> bool:
-    finite = values[np.isfinite(values)]
-    return bool(finite.size) and finite.min() > 0.0 and finite.max() > 10.0 * finite.min()
-
-
-def _comparison(summary: JsonObject, sides: list[str]) -> Figure:
-    rows, metric = summary["holdout"]["rows"], f"{summary['objective']}_rmse"
-    names = list(dict.fromkeys(row["name"] for row in rows))
-    y = name_rows([*map(literal, names)])
-    compared = ((metric, f"worst {error_label(summary)}"), ("convergence_time", "worst convergence time (s)"))
-    panels = [
-        _bars(key, label, y, side * (key == metric), [row for row in rows if row["side"] == side])
-        for (key, label), side in product(compared, sides)
-    ]
-    first, last = summary["holdout"]["seeds"]
-    seeds = f"seeds {first} to {last}" if last > first else f"seed {first}"
-    caption = (
-        f"The gains {_where(summary)}, noise {seeds}: worst of all runs, and the median (stroke). Pale: some runs "
-        "did not converge."
-    )
-    columns = len(sides)
-    return Figure("tuning_holdout", panels, caption, columns, 4.4 * columns + 0.6, 0.9 + 0.3 * len(names))
-
-
-def _bars(key: str, label: str, y: Axis, title: str, rows: list[JsonObject]) -> Panel:
-    """Bars of a figure's worst value for each of the gains, with a stroke at the median."""
-    finite_rows = [
-        (i, row, row[key]["worst"], row[key]["median"]) for i, row in enumerate(rows) if row[key]["worst"] is not None
-    ]
-    lengths = [worst for *_, worst, _ in finite_rows]
-    log = bool(lengths) and min(lengths) > 0.0 and max(lengths) > 30.0 * min(lengths)
-    low = 0.5 * min(median or worst for *_, worst, median in finite_rows if worst) if log else 0.0
-    high = max(lengths, default=1.0) * (3.0 if log else 1.22) or 1.0
-    parts: list[Part] = [
-        Bars([i], [worst], "", VERMILION if row["name"] == "tuned" else SKY, texts=[f"{worst:.3g}"],
-             opacity=1.0 if row["converged"] == 1.0 else 0.4)
-        for i, row, worst, _ in finite_rows
-    ]  # fmt: skip
-    medians = np.array([median for *_, median in finite_rows], float)
-    parts.append(Line(medians, [i for i, *_ in finite_rows], width=0.0, marker="|", size=12.0))
-    lost = [(i, row) for i, row in enumerate(rows) if row[key]["worst"] is None]
-    texts = [f"converged in {100 * row['converged']:.3g} %" if row["finite"] == 1.0 else "diverged" for _, row in lost]
-    parts.append(place_words([low] * len(lost), [i for i, _ in lost], texts))
-    return Panel(Axis(label, log=log, ends=(low, high)), y, parts, title)
 
 
 def write_tuning(tuning: Tuning, folder: Path) -> str:
