@@ -1,4 +1,4 @@
-"""The comparison of two sweeps: which metrics changed, `comparison.json`, and a figure of where they moved most."""
+"""The comparison of two sweeps: which metrics changed and by what factor, and `comparison.json`."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
@@ -11,36 +11,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, is_boolean
+from jaxbl.config import is_boolean
 from jaxbl.files import write_atomic, write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 from jaxbl.sweeps.metrics import find_metric
 
-from .maps import axis_of, cell_edges, colour_scale, is_log, path_words, value_label
+from .maps import value_label
 from .panels import (
     BLUE,
-    COLOURS,
-    MISSING,
-    Array,
     Axis,
-    Dots,
     Figure,
-    Line,
-    Map,
     Panel,
-    Part,
-    Scale,
     Span,
     intervals,
     name_rows,
 )
 
-_PANELS = 3
 _ROWS = 12
-_FEW = 0.05
 """Share of points up to which a map of where a metric changed would be empty."""
-_EVEN = 1.1
 """Factor within which a change is the same everywhere: a map of it would have one colour."""
 
 
@@ -177,47 +166,21 @@ def _value(value: Any) -> str:
 
 
 def draw_comparison(comparison: Comparison) -> list[Figure]:
-    """The factors of the metrics that changed, and maps over the last two axes of those whose change is not the same
-    everywhere, or lines over one; nothing where none changed."""
+    """Mean and spread of the factor of each metric that changed and has one; nothing where there is none."""
     changes = sorted((change for change in comparison.metrics if change.count), key=lambda change: not change.better)
-    if not changes:
+    rows = {}
+    for metric, mean in ((change.metric, change.moved.value) for change in changes if not is_boolean(change.metric)):
+        factor = _divide(comparison.frame(metric), metric).replace([np.inf, 0.0], np.nan)
+        if factor.gt(0.0).any():
+            rows[value_label(metric)] = factor.quantile(0.05), mean, factor.quantile(0.95)
+    if not rows:
         return []
-    config, frames = comparison.first_config, {change.metric: comparison.frame(change.metric) for change in changes}
-    figures = _factors(frames, {change.metric: change.moved.value for change in changes})
-    frame = next(iter(frames.values()))
-    varied = [path for path in comparison.axes if frame[path].nunique() > 1]
-    # of axes that advance together one is enough
-    labels = {path: path for path in varied} | {axis.path: axis.zip or axis.path for axis in config.axes}
-    numbers = [path for path in varied if pd.api.types.is_numeric_dtype(frame[path])]
-    axes = list({labels[path]: path for path in reversed(numbers)}.values())[1::-1]
-    if not axes:
-        return figures
-    is_map, beyond = len(axes) > 1, _noise_name(comparison)
-    drawn = {labels[path] for path in axes}
-    words = [path_words(config, path) for path in axes]
-    averaged = ", ".join(path_words(config, path) for path in varied if labels[path] not in drawn)
-    averaged = f", median over {averaged}" if averaged else ""
-    if is_map:
-        uneven = [
-            change
-            for change in changes
-            if change.count > _FEW * change.points and _spread(frames[change.metric], change.metric) > _EVEN
-        ]
-        panels = [_map(config, change, frames[change.metric], axes, beyond) for change in uneven[:_PANELS]]
-        caption = (
-            "Factor from the first study to the second (of what is true or false, difference of the share) over "
-            f"{words[1]} and {words[0]}{averaged}; grey: at most half of the points differ by more than {beyond}."
-        )
-    else:
-        panels = [_line(config, change.metric, frames[change.metric], axes[0]) for change in changes[:_PANELS]]
-        caption = f"Both studies over {words[0]}{averaged}; where there are points, they differ by more than {beyond}."
-    columns = len(panels)
-    return figures + [Figure("comparison", panels, caption, columns, max(3.9 * columns, 5.0), 3.2)] * bool(panels)
-
-
-def _change(frame: pd.DataFrame, metric: str) -> Any:
-    """The factor at each point, NaN where there is none; of what is true or false the difference."""
-    return _divide(frame, metric).replace([np.inf] if is_boolean(metric) else [np.inf, 0.0], np.nan)
+    names = list(rows)[:_ROWS]
+    ends = zip(*(rows[name] for name in names), strict=True)
+    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(range(len(names)), *ends, colour=BLUE)]
+    caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
+    x = Axis("factor from the first study to the second", log=True)
+    return [Figure("factors", [Panel(x, name_rows(names), parts)], caption, height=0.9 + 0.3 * len(names))]
 
 
 def _divide(frame: pd.DataFrame, metric: str) -> Any:
@@ -225,84 +188,3 @@ def _divide(frame: pd.DataFrame, metric: str) -> Any:
     first, second = frame["first"], frame["second"]
     with np.errstate(divide="ignore", invalid="ignore"):
         return second - first if is_boolean(metric) else second / first
-
-
-def _spread(frame: pd.DataFrame, metric: str) -> float:
-    """The factor between large and small changes of a metric; of what is true or false, infinitely many."""
-    if is_boolean(metric):
-        return math.inf
-    low, high = _change(frame, metric).quantile([0.05, 0.95])
-    return high / low
-
-
-def _factors(frames: dict[str, pd.DataFrame], means: dict[str, float]) -> list[Figure]:
-    """Mean and spread of the factor of each metric that has one."""
-    rows = {
-        value_label(metric): (change.quantile(0.05), means[metric], change.quantile(0.95))
-        for metric, frame in list(frames.items())[:_ROWS]
-        if not is_boolean(metric) and (change := _change(frame, metric)).gt(0.0).any()
-    }
-    if not rows:
-        return []
-    places = list(range(len(rows)))
-    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(places, *zip(*rows.values(), strict=True), colour=BLUE)]
-    caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
-    x = Axis("factor from the first study to the second", log=True)
-    return [Figure("factors", [Panel(x, name_rows(list(rows)), parts)], caption, height=0.9 + 0.3 * len(rows))]
-
-
-def _map(config: Config, metric: MetricChange, frame: pd.DataFrame, axes: list[str], beyond: str) -> Panel:
-    """Factors over two axes."""
-    boolean = is_boolean(metric.metric)
-    change = _change(frame, metric.metric)
-    places = frame[axes].assign(change=change, differs=frame["differs"].astype(float)).groupby(axes, sort=True)
-    table, share = places["change"].median(), places["differs"].mean()
-    values = table.to_numpy(float)
-    scale = _scale(values, boolean, "RdBu_r" if metric.better != "more" else "RdBu")
-    y, x = (np.unique(frame[path].to_numpy(float)) for path in axes)
-    drawn = [
-        axis_of(config, path, numbers, _is_drawn_log(config, path, numbers))
-        for path, numbers in zip(axes[::-1], (x, y), strict=True)
-    ]
-    name = f"within {beyond}"
-    if 2 * len(table) > len(x) * len(y):
-        across, up = (cell_edges(numbers, axis.log) for numbers, axis in zip((x, y), drawn, strict=True))
-        same = share.unstack().fillna(1.0).to_numpy(float) <= 0.5
-        parts: list[Part] = [Map(across, up, table.unstack().to_numpy(float), scale, same, name)]
-    else:
-        # points of a design, or of a refined study
-        points, far = table.reset_index(), share.to_numpy() > 0.5
-        near, differing = points[~far], points[far]
-        parts = [
-            Line(near[axes[1]], near[axes[0]], name, MISSING, 0.0, marker=".", size=3.0),
-            Dots(differing[axes[1]], differing[axes[0]], values[far], scale),
-        ]
-    return Panel(*drawn, parts, metric.metric)
-
-
-def _scale(values: Array, boolean: bool, colours: str) -> Scale:
-    """Colours about no change."""
-    finite = values[np.isfinite(values)]
-    if boolean:
-        most = max(float(np.abs(finite).max(initial=0.0)), 1e-3)
-        return Scale(-most, most, "difference of the share", colours=colours)
-    # a few extremes would leave no colour for all else
-    sizes = np.abs(np.log(finite[finite > 0.0])) if finite.size else np.zeros(1)
-    most = max(math.exp(min(float(np.quantile(sizes, 0.98)), 100.0)), 1.0 + 1e-6)
-    return Scale(1.0 / most, most, "factor", True, colours)
-
-
-def _line(config: Config, metric: str, frame: pd.DataFrame, path: str) -> Panel:
-    """Both studies over one axis."""
-    groups = frame.groupby(path, sort=True)
-    medians, far = groups[["first", "second"]].median(), groups["differs"].any().to_numpy(bool)
-    x, parts = medians.index.to_numpy(float), list[Part]()
-    for name, colour in zip(medians, COLOURS, strict=False):
-        values = medians[name].to_numpy(float)
-        parts += [Line(x, values, name, colour), Line(x[far], values[far], colour=colour, width=0.0, marker="o", size=4.0)]
-    scale = colour_scale(medians.to_numpy(float), value_label(metric))
-    return Panel(axis_of(config, path, x, _is_drawn_log(config, path, x)), Axis(scale.label, metric, scale.log), parts)
-
-
-def _is_drawn_log(config: Config, path: str, values: Array) -> bool:
-    return any(axis.path == path for axis in config.axes) and is_log(config, path, values)

@@ -9,8 +9,7 @@ from jaxbl.files import to_jsonable, write_json
 from jaxbl.lines import percent
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
-from jaxbl.records.signal_quality import longest_segment, low_pass, power_spectrum
-from jaxbl.records.time_stamps import GAP_PERIODS
+from jaxbl.records.signal_quality import low_pass
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .numbers import lead_with_doubt
@@ -25,11 +24,9 @@ from .panels import (
     VERMILION,
     ZERO,
     Axis,
-    Bars,
     Figure,
     Line,
     Panel,
-    Part,
     Span,
     cloud,
     join,
@@ -100,13 +97,11 @@ def _channel_table(record: Record) -> list[tuple[str, ...]]:
 def draw_inspection(inspection: Inspection) -> list[Figure]:
     """All figures of an inspected log."""
     record = inspection.record
-    figures = [_channels(record), _spectra(record)]
+    figures = [_channels(record)]
     if record.torque is not None and np.ptp(record.torque):
         figures.append(_torque_over_velocity(record))
     if inspection.twist is not None:
         figures.append(_twist(inspection))
-    if not record.statistics.sampling.even:
-        figures.append(_intervals(record))
     return figures
 
 
@@ -128,27 +123,6 @@ def _channels(record: Record) -> Figure:
     ]
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
     return stack("channels", panels, caption, 1.5)
-
-
-def _spectra(record: Record) -> Figure:
-    part, panels = longest_segment(record.segments), []
-    for name, signal in _values(record).items():
-        if not np.ptp(signal):
-            continue
-        channel, (label, colour) = record.statistics.channels[name], _CHANNELS[name]
-        frequency, density = power_spectrum(signal[part], record.sample_period)
-        parts: list[Part] = [Line(frequency[1:], np.sqrt(density[1:]), colour=colour, width=1.0)]
-        if channel.noise:
-            floor = channel.noise * np.sqrt(2.0 * record.sample_period)
-            parts.append(Span(floor, floor, f"noise {channel.noise:.2g} {channel.unit} rms", "#555555", "y"))
-        if channel.bandwidth:
-            power = "of velocity's power" if name.startswith("theta") else "of power"
-            text = f"95 % {power} below {channel.bandwidth:.3g} Hz"
-            parts.append(Span(channel.bandwidth, channel.bandwidth, text, "#555555", dashes=":"))
-        y = Axis(f"{label}\n({channel.unit}/√Hz)", log=True)
-        panels.append(Panel(Axis("frequency (Hz)", log=True), y, parts))
-    caption = "Amplitude spectral densities (Welch), the noise floor, and the bandwidth of each channel."
-    return stack("spectra", panels, caption, 2.1)
 
 
 def _torque_over_velocity(record: Record) -> Figure:
@@ -207,16 +181,3 @@ def _twist(inspection: Inspection) -> Figure:
         "encoders or gears.",
         columns=len(panels),
     )
-
-
-def _intervals(record: Record) -> Figure:
-    median = record.statistics.sampling.median_period
-    inside = record.intervals <= GAP_PERIODS * median
-    times, lengths = np.cumsum(record.intervals)[inside], 1e3 * record.intervals[inside]
-    counts, edges = np.histogram(lengths, bins=60)
-    bars = Bars(0.5 * (edges[1:] + edges[:-1]), counts, thickness=edges[1] - edges[0])
-    stamps = [cloud(times, lengths, colour=BLUE), Span(1e3 * median, 1e3 * median, "median", VERMILION, "y")]
-    y = Axis("interval\n(ms)")
-    panels = [Panel(TIME, y, stamps), Panel(Axis("samples (1)"), y, [bars])]
-    caption = "Intervals between raw time stamps, before resampling; gaps are left out."
-    return Figure("intervals", panels, caption, 2, height=2.6, widths=(3.0, 1.0))
