@@ -19,11 +19,9 @@ from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
 from jaxbl.result import KeyFigure, Result, ResultTable
-from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .maps import axis_label, axis_of, cell_edges, with_value
+from .maps import axis_label, with_value
 from .panels import (
-    COLOURS,
     SIDE_COLOURS,
     Axis,
     Figure,
@@ -47,8 +45,6 @@ def draw_choice(choice: ObserverChoice) -> list[Figure]:
     sides = list(summary["points"][0]["sides"])
     if len(summary["points"]) == 1:
         return [_ratios(summary, sides)]
-    if len(_varied_values(choice.config, summary, sides[0])) == 1:
-        return [_lines(choice.config, summary, side) for side in sides]
     return [_map(choice.config, summary, side) for side in sides]
 
 
@@ -103,64 +99,37 @@ def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, 
     return {path: values for path, values in columns.items() if len(values) > 1}
 
 
-def _place(config: Config, path: str, values: Sequence[Any]) -> tuple[np.ndarray, Axis]:
-    """Return where each value of an axis is drawn, and the axis: words, and numbers that are near one another, evenly."""
-    are_numbers = all(isinstance(value, int | float) for value in values)
-    if are_numbers and min(values) > 0.0 and max(values) / min(values) > 20.0:
-        places = np.asarray(values, float)
-        return places, axis_of(config, path, places, log=True)
-    texts = [f"{value:.4g}" if are_numbers else str(value) for value in values]
-    ends = -0.5, len(values) - 0.5
-    return np.arange(len(values), dtype=float), Axis(
-        axis_label(config, path), path, ends=ends, names=tuple(enumerate(texts))
-    )
-
-
-def _lines(config: Config, summary: JsonObject, side: str) -> Figure:
-    """Errors over the one axis that has several values."""
-    ((path, values),) = _varied_values(config, summary, side).items()
-    places, x = _place(config, path, values)
-    parts = []
-    for i, kind in enumerate(summary["observers"]):
-        errors = np.array([point["sides"][side]["kinds"][kind]["error"] for point in summary["points"]], float)
-        dashes = ("-", "--", ":")[i // len(COLOURS) % 3]
-        parts.append(Line(places, errors, kind, COLOURS[i % len(COLOURS)], dashes=dashes, marker="o", size=4.0))
-    caption = f"{side}: error of each kind, tuned at each point, {_where(summary)}."
-    panel = Panel(x, Axis(f"{side}: {error_label(summary)}", log=True), parts, side)
-    return Figure(f"observers_{side}", [panel], caption, height=4.0)
-
-
-def _two_digits(value: float) -> str:
-    """A number that is read at a glance."""
-    return f"{float(f'{value:.2g}'):g}" if value < 1e5 else f"{value:.0e}"
-
-
-_SHORT_LIMIT = 3
 """Letters of a kind on a map."""
 
 
 def short_names(kinds: Sequence[str]) -> dict[str, str]:
-    """Few letters for each kind: the initials of its words, with a number in full; more letters where two are the same."""
+    """Few letters for each kind: the initials of its words, with a number in full, and a stroke where two are the same."""
     names: dict[str, str] = {}
     for kind in kinds:
-        words = kind.split("_")
-        name = "".join(word if word.isdigit() else word[0].upper() for word in words)
-        if name in names.values():
-            name = words[0][:_SHORT_LIMIT].capitalize()
+        name = "".join(word if word.isdigit() else word[0].upper() for word in kind.split("_"))
         while name in names.values():
             name += "'"
         names[kind] = name
     return names
 
 
+def _axis(config: Config, path: str, values: Sequence[Any]) -> Axis:
+    """An axis with its values in words, evenly."""
+    texts = [f"{value:.4g}" if isinstance(value, int | float) else str(value) for value in values]
+    return Axis(axis_label(config, path), path, ends=(-0.5, len(values) - 0.5), names=tuple(enumerate(texts)))
+
+
 def _map(config: Config, summary: JsonObject, side: str) -> Figure:
     """The best kind at each point; a panel for each value of further axes."""
     varied, short, kinds = _varied_values(config, summary, side), short_names(summary["observers"]), summary["observers"]
-    (x, xs), (y, ys) = list(varied.items())[-1:-3:-1]
+    # over one axis a map has a single row
+    (x, xs), (y, ys), *_ = [*reversed(varied.items()), ("", [None])]
     further = {path: values for path, values in varied.items() if path not in (x, y)}
-    points = {tuple(point["values"][path] for path in (*further, y, x)): point["sides"][side] for point in summary["points"]}
-    (across, x_axis), (up, y_axis) = _place(config, x, xs), _place(config, y, ys)
-    edges = cell_edges(across, x_axis.log), cell_edges(up, y_axis.log)
+    points = {
+        tuple(point["values"].get(path) for path in (*further, y, x)): point["sides"][side] for point in summary["points"]
+    }
+    x_axis, y_axis = _axis(config, x, xs), _axis(config, y, ys) if y else Axis(names=((0.0, ""),))
+    edges = [np.arange(len(values) + 1) - 0.5 for values in (xs, ys)]
     scale = Scale(-0.5, 9.5, "", colours="tab10")
     numbers = {kind: i % 10 for i, kind in enumerate(kinds)}
     winners = {point["best"] for point in points.values()} - {None}
@@ -169,7 +138,7 @@ def _map(config: Config, summary: JsonObject, side: str) -> Figure:
         cells = [[points[*values, v, u] for u in xs] for v in ys]
         best = np.array([[numbers.get(cell["best"], np.nan) for cell in row] for row in cells])
         texts = [_cell_text(cell, short) for row in cells for cell in row]
-        place_x, place_y = (axis.ravel() for axis in np.meshgrid(across, up))
+        place_x, place_y = (axis.ravel() for axis in np.meshgrid(*map(np.arange, best.shape[::-1])))
         winners_map = Map(*edges, best, scale, np.isnan(best), "all diverge, or are too slow")
         parts = [winners_map, Line(place_x, place_y, width=0.0, texts=texts)]
         title = ", ".join(with_value(config, *pair) for pair in zip(further, values, strict=True))
@@ -190,7 +159,7 @@ def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
     if best is None:
         return ""
     text, ratio = short[best] + ("=" if point["not_told_apart"] else ""), point["kinds"][reference]["ratio"]
-    return text if best == reference else f"{text}\n{short[reference]} {'–' if ratio is None else f'×{_two_digits(ratio)}'}"
+    return text if best == reference else f"{text}\n{short[reference]} {'–' if ratio is None else f'×{ratio:.2g}'}"
 
 
 def write_choice(choice: ObserverChoice, folder: Path) -> str:
@@ -258,50 +227,22 @@ def _where(summary: JsonObject) -> str:
 
 
 def choice_headline(summary: JsonObject) -> Lines:
-    """Which kind is best, and by how much, in sentences."""
-    points = summary["points"]
-    sides = points[0]["sides"]
-    if len(points) > 1:
-        return [line for side in sides for line in _map_lines(side, summary)]
-    return [_best_line(side, result, summary) for side, result in sides.items()]
-
-
-def _best_line(side: str, result: JsonObject, summary: JsonObject) -> str:
-    compared, lost = _sort_kinds(result["kinds"])
-    if not compared:
-        return f"{side}: all kinds diverged or were too slow."
-    best, *worse = compared
-    equal = result["not_told_apart"]
-    lead = (
-        f"{side}: {best} and {', '.join(equal)} are the best and cannot be told apart"
-        if equal
-        else f"{side}: {best} is the best of {len(result['kinds'])}"
-    )
-    unit = SIDE_METRICS[f"{summary['objective']}_rmse"].unit
-    line = f"{lead}: {summary['objective']} error {compared[best]['error']:.3g} {unit} rms with {best} ({_where(summary)})."
-    if worse:
-        line += f" Times as much with: {', '.join(f'{kind} {_ratio(compared[kind])}' for kind in worse)}."
-    return f"{line} Diverged, or too slow: {', '.join(lost)}." if lost else line
-
-
-def _map_lines(side: str, summary: JsonObject) -> Lines:
-    points = [point["sides"][side] for point in summary["points"]]
-    counts = Counter(point["best"] for point in points if point["best"] is not None)
-    shared = Counter(point["best"] for point in points if point["not_told_apart"])
-    parts = [
-        f"{kind} at {count}" + (f" ({shared[kind]} not told apart from another)" if shared[kind] else "")
-        for kind, count in counts.most_common()
-    ]
-    first = summary["observers"][0]
-    parts += [f"{first} at none"] if first not in counts else []
-    lines = [f"{side}, {len(points)} points, least {summary['objective']} error ({_where(summary)}): {', '.join(parts)}."]
-    spans = []
-    for kind in summary["observers"]:
-        ratios = [ratio for point in points if (ratio := point["kinds"][kind]["ratio"]) is not None]
-        if ratios:
-            missed = f" and none at {len(points) - len(ratios)} points" if len(ratios) < len(points) else ""
-            spans.append(f"{kind} {min(ratios):.3g} to {max(ratios):.3g}{missed}")
-    return [*lines, f"{side}, times the best one's error: {', '.join(spans)}."]
+    """Which kind is best on each side, at how many points, and what fails; the table has by how much."""
+    lines = []
+    for side in summary["points"][0]["sides"]:
+        results = [point["sides"][side] for point in summary["points"]]
+        counts = Counter(result["best"] for result in results if result["best"] is not None)
+        shared = Counter(kind for result in results for kind in result["not_told_apart"])
+        kinds = [
+            f"{kind} is best at {count} of {len(results)} points" if len(results) > 1 else f"{kind} is best"
+            for kind, count in counts.most_common()
+        ]
+        line = f"{side}: {', '.join(kinds) or 'all kinds diverge, or are too slow'}"
+        if counts and shared:
+            line += f"; not told apart from the best: {', '.join(shared)}"
+        lost = dict.fromkeys(kind for result in results for kind in _sort_kinds(result["kinds"])[1])
+        lines.append(f"{line}; diverge somewhere, or are too slow: {', '.join(lost)}." if counts and lost else f"{line}.")
+    return lines
 
 
 def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
