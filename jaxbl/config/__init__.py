@@ -1,6 +1,11 @@
 """The TOML study: its tables, their validation, and the experiment that they describe."""
 
-from .gains import TUNE_NAMES as TUNE_NAMES, SideCertificateTable as SideCertificateTable, TuneTable as TuneTable
+from .gains import (
+    LOOP_OBJECTIVES as LOOP_OBJECTIVES,
+    TUNE_NAMES as TUNE_NAMES,
+    SideCertificateTable as SideCertificateTable,
+    TuneTable as TuneTable,
+)
 from .reading import (
     ConfigSource as ConfigSource,
     read_config as read_config,

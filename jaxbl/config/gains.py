@@ -45,6 +45,24 @@ class GainPairTable(Table):
     alpha: float = declare_key("gain alpha", unit="rad/s²", ge=0.0)
 
 
+class LoopGainTable(Table):
+    """A gain of a closed loop that is searched together with others."""
+
+    path: str = declare_key("dotted path of the gain, e.g. controller.position_gain")
+    start: float | None = declare_key("least value tried; left out: a tenth of the study's", None, gt=0.0)
+    stop: float | None = declare_key("largest value tried; left out: ten times the study's", None, gt=0.0)
+
+    @model_validator(mode="after")
+    def _check_order(self) -> "LoopGainTable":
+        if self.start is not None and self.stop is not None and self.start >= self.stop:
+            raise table_error(f"start {self.start} should be less than stop {self.stop}")
+        return self
+
+
+LOOP_OBJECTIVES = {"following": "following_rmse", "settling": "settling_time", "limit_cycle": "limit_cycle_amplitude"}
+"""Objectives of a closed loop, and the metrics of the controlled side that they make least."""
+
+
 class CompareTable(Table):
     """Other gains that tuned ones are compared with."""
 
@@ -102,8 +120,22 @@ class TuneTable(Table):
     Left out, `observers` is the study's own kind, super_twisting, whose lambda and alpha are searched on a map.
     """
 
-    objective: Literal["velocity", "torque"] = declare_key(
-        "rms error over the last quarter of the run that is made least, worst over the seeds", "velocity"
+    objective: Literal["velocity", "torque", "following", "settling", "limit_cycle"] = declare_key(
+        "rms error of the observers over the last quarter of the run that is made least, worst over the seeds; or, of a "
+        "closed loop, its rms following error, settling time or limit cycle",
+        "velocity",
+    )
+    gains: list[LoopGainTable] = declare_key(
+        "of an objective of the loop: [[tune.gains]], of controller and observers, that are searched together; left out: "
+        "those of the observers",
+        [],
+        max_length=20,
+    )
+    longest_settling: float | None = declare_key(
+        "of an objective of the loop: settling time allowed", None, unit="s", gt=0.0
+    )
+    largest_limit_cycle: float | None = declare_key(
+        "of an objective of the loop: amplitude allowed of the limit cycle", None, unit="rad", gt=0.0
     )
     worst_over_uncertainty: bool = declare_key(
         "worst also over the corners of inertias and viscous frictions (1 ± uncertainty.relative)", False
@@ -159,19 +191,26 @@ class TuneTable(Table):
             for name, field in type(self).model_fields.items()
             if getattr(self, name) != field.get_default(call_default_factory=True)
         ]
+        in_loop = self.objective in LOOP_OBJECTIVES
+        for key in ("gains", "longest_settling", "largest_limit_cycle"):
+            if key in changed and not in_loop:
+                raise table_error(f"{key} needs an objective of the loop: {', '.join(LOOP_OBJECTIVES)}")
         if not self.observers:
-            for key in ("trials", "axes"):
+            for key in ("axes",) if in_loop else ("trials", "axes"):
                 if key in changed:
                     raise table_error(f"{key} needs observers, the kinds to choose from; add them, or leave {key} out")
+        if not self.observers and not in_loop:
             return
         for i, kind in enumerate(self.observers):
             if kind not in OBSERVERS:
                 raise table_error(f"observers[{i}]: unknown kind '{kind}'; {suggest_word(kind, OBSERVERS)}")
             if kind in self.observers[:i]:
                 raise table_error(f"observers[{i}]: '{kind}' is listed already; each kind may be listed once")
-        for key in ("margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare", "certificate"):
+        keys = "margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare", "certificate"
+        for key in (*keys, "observers", "longest_convergence") if in_loop else keys:
             if key in changed:
-                raise table_error(f"{key} does not go with observers; leave one of them out")
+                other = f"objective = '{self.objective}'" if in_loop else "observers"
+                raise table_error(f"{key} does not go with {other}; leave one of them out")
         for i, axis in enumerate(self.axes):
             if axis.path.partition(".")[0] in ("observer", "equivalent_control"):
                 raise table_error(f"axes[{i}].path: '{axis.path}' is the observer's, which is searched; choose another path")

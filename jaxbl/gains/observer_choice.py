@@ -30,7 +30,7 @@ from .stages import Stages, stage_tables
 
 TIME_CONSTANT = "equivalent_control.time_constant"
 """Searched together with the gains if the torque is the objective: its estimate is behind this low-pass."""
-_LEAST_HELD_OUT_SEEDS = 8
+LEAST_HELD_OUT_SEEDS = 8
 """Least number of held-out seeds: fewer give a wide interval."""
 _CONFIDENCE = 0.95
 _UNFINISHED_SHARE = 0.02
@@ -69,6 +69,7 @@ class SideSearch:
         best: gains with the least error so far.
         error: the least error so far.
         error_before: the error before the last zoom.
+        widest_cell: most half width of the next window, as a share of the last one on a log scale.
     """
 
     limits: dict[str, tuple[float, float]]
@@ -76,6 +77,7 @@ class SideSearch:
     best: GainValues
     error: float = math.inf
     error_before: float = math.inf
+    widest_cell: float = 1.0
 
     def trial_gains(self, unit: np.ndarray) -> NamedArrays:
         """Return the values of each gain at points of the unit cube, shape (trials, free gains)."""
@@ -99,7 +101,7 @@ class SideSearch:
         free = [path for path, (low, high) in self.window.items() if low < high]
         for path in free:
             (low, high), (least, largest) = self.window[path], self.limits[path]
-            cell = (high / low) ** (len(errors) ** (-1.0 / len(free)))
+            cell = (high / low) ** min(len(errors) ** (-1.0 / len(free)), self.widest_cell)
             self.window[path] = max(self.best[path] / cell, least), min(self.best[path] * cell, largest)
 
     def gains_at_ends(self) -> list[str]:
@@ -155,7 +157,7 @@ class _KindSearch:
         self.config, self.table, self.stages = config, table, stages
         self.sides = config.build().sides
         self.seeds = config.sweep.seeds
-        self.held_out_seeds = max(self.seeds, _LEAST_HELD_OUT_SEEDS)
+        self.held_out_seeds = max(self.seeds, LEAST_HELD_OUT_SEEDS)
         self.groups = _group_points(config, table, stages)
         rows = sum(len(point.scenarios.names) for group in self.groups for point in group.points)
         runs = len(table.observers) * rows * len(self._side_sets())

@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from jaxbl.cluster import Scheduler
-from jaxbl.config import Config, ConfigSource, TuneTable, read_config
+from jaxbl.config import LOOP_OBJECTIVES, Config, ConfigSource, TuneTable, read_config
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.observer import AbstractSuperTwisting
@@ -24,6 +24,7 @@ from jaxbl.workers import Progress
 
 from .certificate import certify_best_gains, choose_certified_gains
 from .gain_search import GainSearch
+from .loop_gains import LoopTuning, tune_loop
 from .observer_choice import ObserverChoice, choose_observer
 from .pilot import Scenarios, list_scenarios, run_pilot
 from .stages import Stages, open_stages
@@ -62,8 +63,9 @@ def tune(
     overwrite: bool = False,
     backend: Backend | None = None,
     scheduler: Scheduler = None,
-) -> Tuning | ObserverChoice:
-    """Choose lambda and alpha of both observers for a study, or with `tune.observers` a kind of observer and its gains.
+) -> Tuning | ObserverChoice | LoopTuning:
+    """Choose lambda and alpha of both observers for a study, with `tune.observers` a kind of observer and its gains,
+    or with an objective of the loop the gains of observers and controller together.
 
     `out`, `progress`, `devices`, `overwrite`, `backend` and `scheduler` are as in :func:`jaxbl.sweep`. They apply to all
     runs of the search.
@@ -72,7 +74,7 @@ def tune(
         study: TOML file, mapping or config. Its `[tune]` table holds the objective and the constraints; its axes are unused.
 
     Raises:
-        InputError: the config is wrong, or its controller reads the observers; the folder holds something else, or the
+        InputError: the config is wrong, or its objective not that of its loop; the folder holds something else, or the
             backend cannot run the study.
         NoResult: no gains in the range meet the constraints, or the drive diverges.
 
@@ -82,21 +84,26 @@ def tune(
     """
     config = read_config(study)
     table = config.tune or TuneTable()
-    if config.observer.kind != AbstractSuperTwisting.name and not table.observers:
+    in_loop = table.objective in LOOP_OBJECTIVES
+    if in_loop and config.controller is None:
+        raise InputError(f"tune.objective: '{table.objective}' is that of a loop; add [controller] and [reference]")
+    if config.observer.kind != AbstractSuperTwisting.name and not table.observers and not in_loop:
         raise InputError(
             f"observer.kind: tune chooses lambda and alpha of kind '{AbstractSuperTwisting.name}'; for the gains of "
             f"'{config.observer.kind}', put observers = [\"{config.observer.kind}\"] into [tune]"
         )
-    if config.controller is not None and config.controller.build().reads_observers:
+    if config.controller is not None and config.controller.build().reads_observers and not in_loop:
         raise InputError(
-            "controller: it reads the observers whose gains tune searches, so that each gain makes another motion; "
-            "let a cascade have speed_from = 'differences', or sweep over observer and controller gains"
+            f"tune.objective: '{table.objective}' does not go with a controller that reads the observers, as each gain "
+            f"makes another motion; choose {', '.join(LOOP_OBJECTIVES)}, by which the loop is tuned as a whole"
         )
     config = config.model_copy(update={"tune": table})
-    scenarios = None if table.observers else list_scenarios(config, table)
+    scenarios = None if table.observers or in_loop else list_scenarios(config, table)
     with open_stages(
         config, "tune", out, scheduler, progress=progress, devices=devices, overwrite=overwrite, backend=backend
     ) as stages:
+        if in_loop:
+            return tune_loop(config, table, stages)
         if scenarios is None:
             return choose_observer(config, table, stages)
         return _search_gains(config, table, scenarios, stages)

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.cluster import Scheduler
-from jaxbl.config import Config, ConfigSource, read_config
+from jaxbl.config import Config, ConfigSource, TuneTable, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable, write_json
 from jaxbl.json_types import JsonObject
@@ -36,6 +36,7 @@ from .error_system import (
     judge_error_system,
     simulate_error_system,
 )
+from .loop_gains import GAIN_SECTIONS, LoopRuns
 from .marks import judge_marks
 from .stages import Stages, open_stages
 
@@ -136,6 +137,7 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 for damping, boundary in error_map.boundary_by_damping.items()
             ],
             "marks": judge_marks(config, studies["drive"], stages),
+            "loop_margins": _find_loop_margins(config, stages),
             "counterexamples": at_true_bound.head(_MOST_LISTED).to_dict("records"),
             "counterexamples_in_all": len(at_true_bound),
         }
@@ -145,6 +147,15 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
             counterexamples.to_parquet(draft / "counterexamples.parquet", index=False)
             write_json(draft / "verdict.json", summary)
     return Verdict(config, summary, error_map, levels, counterexamples, tuple(stages.fallback_reasons))
+
+
+def _find_loop_margins(config: Config, stages: Stages) -> JsonObject:
+    """Find the margins of a closed loop in the gains that are on axes (:meth:`.loop_gains.LoopRuns.find_margins`)."""
+    if config.controller is None:
+        return {}
+    runs = LoopRuns(config, TuneTable(), stages)
+    gains = runs.own_gains([path for path in config.axis_paths if path.startswith(GAIN_SECTIONS)])
+    return runs.find_margins({path: gain for path, gain in gains.items() if gain > 0.0})
 
 
 def sides_with_gain_axes(config: Config) -> list[str]:

@@ -13,6 +13,7 @@ from jaxbl.estimation.element import ElementIdentification
 from jaxbl.estimation.identify import Identification
 from jaxbl.files import ResultFolder, Subject, lock_folder, log_subject, to_path
 from jaxbl.fused import SCAN_MESSAGE
+from jaxbl.gains.loop_gains import LoopTuning
 from jaxbl.gains.observer_choice import ObserverChoice
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.verify import Verdict
@@ -33,6 +34,7 @@ from .element import describe_element, draw_element, write_element
 from .identify import describe_identification, write_identification
 from .identify_figures import draw_identification
 from .inspect import describe_inspection, draw_inspection, write_inspection
+from .loop_gains import describe_loop_tuning, draw_loop_tuning, write_loop_tuning
 from .maps import draw as draw_study
 from .observer_choice import describe_choice, draw_choice, write_choice
 from .page import PAGE, write_page
@@ -75,6 +77,7 @@ _KINDS = {
     StudyResult: _Kind(describe_sweep, draw_study, write_sweep),
     Tuning: _Kind(describe_tuning, draw_tuning, write_tuning, "tuning.json"),
     ObserverChoice: _Kind(describe_choice, draw_choice, write_choice, "tuning.json"),
+    LoopTuning: _Kind(describe_loop_tuning, draw_loop_tuning, write_loop_tuning, "tuning.json"),
     Verdict: _Kind(describe_verdict, draw_verdict, write_verdict),
     Comparison: _Kind(
         describe_comparison, draw_comparison, write_comparison, "comparison.json", lambda _: Subject("comparison")

@@ -19,6 +19,7 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .error_plane import draw_worst_planes
 from .gain_plane import EXACT, condition_curves, usual_rule_curve
+from .loop_gains import margin_table
 from .maps import cell_edges
 from .panels import BLUE, COLOURS, MARKERS, VERMILION, Axis, Figure, Line, Map, Panel, Part, Scale, cloud, literal, mark
 
@@ -162,6 +163,8 @@ def describe_verdict(verdict: Verdict) -> Result:
         tables[:0] = [_mark_table(marks), *_disturbance_tables(marks)]
     if len(verdict.counterexamples):
         tables.append(_counterexample_table(verdict))
+    if margins := verdict.summary["loop_margins"]:
+        tables.append(margin_table(margins))
     remarks = [*map(_mark_line, marks), *_level_lines(verdict)]
     title = verdict.config.title or "Gain conditions"
     return Result(title, word, headline, figures, remarks, verdict.config.notes, tables)

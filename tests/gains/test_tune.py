@@ -378,7 +378,7 @@ BAD = {
     "key of the holdout": (rigid_tune_study(tune={"holdout": {"kind": "sine", "a": 1}}), "tune.holdout: unknown key 'a'"),
     "loop that reads the observer": (
         rigid_tune_study(**LOOP | {"controller": CASCADE | {"speed_from": "observer"}}),
-        "controller: it reads the observers whose gains tune searches",
+        "tune.objective: 'velocity' does not go with a controller that reads the observers",
     ),
     "no inertia left": (
         rigid_tune_study({"uncertainty.relative": 1.5}, tune={"worst_over_uncertainty": True}),

@@ -1,0 +1,86 @@
+"""What `jaxbl tune` leaves to be read of a closed loop: tuned gains, their margins, and the error over each gain."""
+
+# pandas' own annotations are wider than what its methods return
+# pyright: reportArgumentType=false
+
+from pathlib import Path
+
+import tomli_w
+
+from jaxbl.files import write_json
+from jaxbl.gains.loop_gains import LoopTuning
+from jaxbl.json_types import JsonObject
+from jaxbl.result import KeyFigure, Result, ResultTable
+from jaxbl.sweeps.metrics import find_metric
+
+from .maps import axis_label
+from .panels import BLUE, VERMILION, Axis, Figure, Panel, arrange, cloud, mark, with_unit
+from .tune import for_title
+
+
+def draw_loop_tuning(tuning: LoopTuning) -> list[Figure]:
+    """The error of all gains tried, over each gain."""
+    summary, tried, panels = tuning.summary, tuning.candidates, []
+    metric = find_metric(summary["objective_metric"].split()[0])
+    for path, gain in summary["gains"].items():
+        parts = [
+            cloud(tried[path], tried["error"], "tried", BLUE, marker="o", size=3.0),
+            mark(gain, summary["error_in_search"], "tuned", "*", 12.0, VERMILION),
+        ]
+        axes = Axis(axis_label(tuning.config, path), path, log=True), Axis(with_unit(metric.label, metric.unit), log=True)
+        panels.append(Panel(*axes, parts))
+    columns = arrange(len(panels))
+    caption = "Error of the gains tried, the worst over all runs, over each of the gains searched together."
+    return [Figure("loop_gains", panels, caption, columns, 3.6 * columns, 3.2)]
+
+
+def write_loop_tuning(tuning: LoopTuning, folder: Path) -> str:
+    """Write `gains.toml` and `tuning.json`. Returns the study's TOML."""
+    summary, data = tuning.summary, {}
+    for path, gain in summary["gains"].items():
+        *names, key = path.split(".")
+        table = data
+        for name in names:
+            table = table.setdefault(name, {})
+        table[key] = gain
+    head = (
+        f"# Gains of a loop chosen by 'jaxbl tune'{for_title(summary)}\n# Objective: {summary['objective_metric']}.\n"
+        '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n'
+    )
+    (folder / "gains.toml").write_text(head + tomli_w.dumps(data), encoding="utf-8")
+    write_json(folder / "tuning.json", summary, allow_nan=False)
+    return tuning.config.to_toml()
+
+
+def describe_loop_tuning(tuning: LoopTuning) -> Result:
+    """Say by how much the loop is better, and how far each gain is from where it no longer holds."""
+    summary, compared = tuning.summary, tuning.summary["compared"]
+    name, unit = summary["objective_metric"].split(" ", 1)
+    label, ranking = find_metric(name).label, summary["ranking"]
+    tuned, study = ranking["tuned"], ranking.get("study", {"error": None})
+    verdict, headline = "good", f"Take these gains of the loop: {label} {tuned['error'] or float('inf'):.3g} {unit[1:-1]}."
+    if tuned["error"] is None:
+        verdict, headline = "failed", "The gains fail under other noise: the loop diverges or does not settle in some run."
+    elif study["error"] is None and "study" in compared:
+        headline += " With the study's own the loop diverges or does not settle."
+    elif tuned["ratio"] > 1.0 or "study" not in compared:
+        verdict, headline = "doubtful", "No gains tried are better than the study's own."
+    figures = [KeyFigure(f"{gain:.4g}", path) for path, gain in list(summary["gains"].items())[:4]]
+    remarks = []
+    if study["error"] and tuned["error"]:
+        remarks.append(f"With the study's own gains it is {study['ratio']:.3g} times as much.")
+    if ends := summary["at_range_end"]:
+        remarks.append(f"Best at an end of the range searched: {', '.join(ends)}. Beyond it may be better ones.")
+    numbers = [row["gains"] | {key: value for key, value in row.items() if key != "gains"} for row in compared.values()]
+    rows = [[key, *(row[key] for row in numbers)] for key in numbers[0]]
+    tables = [
+        ResultTable("Gains, and the worst of held-out runs", ["", *compared], rows), margin_table(summary["margins"])
+    ]  # fmt: skip
+    return Result(tuning.config.title or "Closed loop", verdict, headline, figures, remarks, tuning.config.notes, tables)
+
+
+def margin_table(margins: JsonObject) -> ResultTable:
+    """Table of the factors by which each gain of a loop may fall and rise."""
+    rows = [[path, *(margin[way] or "64 and more" for way in ("down", "up"))] for path, margin in margins.items()]
+    heading = "Factors by which a gain alone may change until the following error's range is twice as wide"
+    return ResultTable(heading, ["gain", "divided by", "multiplied by"], rows)
