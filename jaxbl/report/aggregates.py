@@ -1,7 +1,7 @@
 """Medians, means and extremes of a study's runs by groups, in memory that does not grow with the number of runs.
 
-Few rows are kept; many are read part by part as often as is needed. Medians and quantiles are exact either way: of many
-values, each pass counts how many fall into narrow intervals about the ranks sought, until what is left fits into memory.
+Few rows are kept; many are read part by part as often as is needed. Medians and quantiles are exact either way: many values
+are sorted in a file.
 """
 
 # pandas' own annotations are wider than what its methods return
@@ -9,6 +9,7 @@ values, each pass counts how many fall into narrow intervals about the ranks sou
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from jaxbl.sweeps.sweep import StudyResult
 Array = np.ndarray
 
 MOST_VALUES = 4_000_000
-"""Sorted at once: 100 MB with what sorting them takes."""
+"""Sorted in memory: 32 MB."""
 _MOST_KEPT = 20_000_000
 """Values of rows that are kept: 160 MB."""
 
@@ -180,102 +181,37 @@ Stream = Callable[[], Iterable[tuple[Array, Array]]]
 
 def spread(stream: Stream, groups: int, quantiles: Sequence[float]) -> Spread:
     """The spread of numbers in groups 0 ... groups - 1; NaN where a group has none."""
-    count, total = np.zeros(groups, np.int64), 0
-    least, largest = np.full(groups, np.inf), np.full(groups, -np.inf)
-    parts = [(np.zeros(0, int), np.zeros(0))]
-    for of, values in _numbers(stream):
-        np.add.at(count, of, 1)
-        np.minimum.at(least, of, values)
-        np.maximum.at(largest, of, values)
-        total += len(values)
-        if total <= MOST_VALUES:
-            parts.append((of, values))
-        else:
-            parts.clear()
-    empty = count == 0
-    place = np.asarray(quantiles, float)[:, None] * np.maximum(count - 1, 0)
-    # each quantile lies between two ranks
-    ranks = np.stack([np.floor(place), np.ceil(place)], axis=1).astype(np.int64).reshape(-1, groups)
-    if total <= MOST_VALUES:
-        values = np.append(_sort_by_group(parts), np.nan)
-        ranked = values[np.where(empty, len(values) - 1, np.cumsum(count) - count + ranks)]
-    else:
-        ranked = _select_ranks(stream, count, least, largest, ranks)
-    below, above = ranked[::2], ranked[1::2]
+    count = np.zeros(groups, np.int64)
+    for of, _ in _numbers(stream):
+        count += np.bincount(of, minlength=groups)
+    ends, total, empty = np.cumsum(count), int(count.sum()), count == 0
+    first = ends - count
+    with TemporaryFile() as file:
+        # values of a group side by side, and one more for groups without any
+        size = total + 1
+        grouped = np.memmap(file, float, "w+", shape=size) if total > MOST_VALUES else np.empty(size)
+        grouped[-1], free = np.nan, first.copy()
+        for of, values in _numbers(stream):
+            order = np.argsort(of, kind="stable")
+            of = of[order]
+            grouped[free[of] + np.arange(len(of)) - np.searchsorted(of, of)] = values[order]
+            free += np.bincount(of, minlength=groups)
+        for start, end in zip(first, ends, strict=True):
+            grouped[start:end].sort()
+        place = np.asarray([0.0, 1.0, *quantiles])[:, None] * np.maximum(count - 1, 0)
+        # each quantile lies between two ranks
+        below, above = (
+            grouped[np.where(empty, total, first + rank(place).astype(np.int64))] for rank in (np.floor, np.ceil)
+        )
     share = place - np.floor(place)
     with np.errstate(invalid="ignore"):
         # as NumPy interpolates
         between = np.where(share < 0.5, below + (above - below) * share, above - (above - below) * (1.0 - share))
         between = np.where(share == 0.5, 0.5 * (below + above), between)
-    least[empty] = largest[empty] = between[:, empty] = np.nan
-    return Spread(count, least, largest, between)
-
-
-def _sort_by_group(parts: Iterable[tuple[Array, Array]]) -> Array:
-    """Values of all parts, those of the first group first, growing in each group."""
-    of, values = map(np.concatenate, zip(*parts, strict=True))
-    return values[np.lexsort((values, of))]
+    return Spread(count, between[0], between[1], between[2:])
 
 
 def _numbers(stream: Stream) -> Iterator[tuple[Array, Array]]:
     for of, values in stream():
         there = ~np.isnan(values)
         yield of[there], values[there]
-
-
-_SIGN = np.uint64(1 << 63)
-
-
-def _keys(values: Array) -> Array:
-    """Whole numbers in the order of floating-point ones."""
-    bits = (values + 0.0).view(np.uint64)
-    return np.where(bits & _SIGN, ~bits, bits | _SIGN)
-
-
-def _floats(keys: Array) -> Array:
-    return np.where(keys & _SIGN, keys ^ _SIGN, ~keys).view(np.float64)
-
-
-def _select_ranks(stream: Stream, count: Array, least: Array, largest: Array, ranks: Array) -> Array:
-    """The values of some ranks `(ranks, groups)`, growing along the first axis, in each group."""
-    # an empty group has the same ends
-    ends = (np.where(count > 0, values, 0.0) for values in (least, largest))
-    low, high, inside = (np.broadcast_to(values, ranks.shape).copy() for values in (*map(_keys, ends), count))
-    ranks = ranks.copy()
-    while True:
-        # ranks in the same interval share it, as they lie side by side
-        sought = low < high
-        fresh = sought.copy()
-        fresh[1:] &= (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-        numbers = np.cumsum(fresh, axis=0) + np.r_[0, np.cumsum(fresh.sum(axis=0))[:-1]] - 1
-        owners, left = int(fresh.sum()), int(inside[fresh].sum())
-        if left <= MOST_VALUES:
-            break
-        bins = int(np.clip(MOST_VALUES // owners, 4, 4096))
-        width = (high - low) // np.uint64(bins) + np.uint64(1)
-        counts = np.zeros((owners, bins), np.int64)
-        for t, of, keys in _within(stream, low, high, fresh):
-            np.add.at(counts, (numbers[t, of], ((keys - low[t, of]) // width[t, of]).astype(np.int64)), 1)
-        counts = np.cumsum(counts, axis=1)
-        for t, rows in enumerate(sought):
-            up_to = counts[numbers[t, rows]]
-            bin_, place = (up_to <= ranks[t, rows, None]).sum(axis=1), np.arange(len(up_to))
-            before = np.where(bin_ > 0, up_to[place, bin_ - 1], 0)
-            inside[t, rows] = up_to[place, bin_] - before
-            ranks[t, rows] -= before
-            low[t, rows] += bin_.astype(np.uint64) * width[t, rows]
-        high[sought] = np.minimum(low + width - np.uint64(1), high)[sought]
-    if left:
-        parts = [(numbers[t, of], keys) for t, of, keys in _within(stream, low, high, fresh)]
-        sizes = inside[fresh][np.argsort(numbers[fresh])]
-        low[sought] = _sort_by_group(parts)[(np.cumsum(sizes) - sizes)[numbers[sought]] + ranks[sought]]
-    return _floats(low)
-
-
-def _within(stream: Stream, low: Array, high: Array, fresh: Array) -> Iterator[tuple[int, Array, Array]]:
-    """For each rank, of each part: groups and keys of the numbers that lie in the group's interval for that rank."""
-    for of, values in _numbers(stream):
-        keys = _keys(values)
-        for t in np.flatnonzero(fresh.any(axis=1)):
-            there = fresh[t, of] & (keys >= low[t, of]) & (keys <= high[t, of])
-            yield t, of[there], keys[there]

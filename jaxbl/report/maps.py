@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterable
 from functools import lru_cache
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +28,6 @@ from .checks import MOST_PARTS, check_figures, has_words, values_of
 from .gain_plane import condition_curves
 from .panels import (
     COLOURS,
-    MARKERS,
     MISSING,
     SIDES,
     Array,
@@ -503,47 +503,30 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
 
 
 def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Panel], str]:
-    """Points of lines that theory gives a slope for, with the lines fitted."""
+    """Points of lines that theory gives a slope for, with the lines fitted; a line without a law has its name."""
     panels = []
-    for facet in dict.fromkeys(None if spec.facet is None else law.where[spec.facet] for law in laws):
-        members = [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
-        values = np.concatenate([law.y_values for law in members])
-        values = values[np.isfinite(values) & (values > 0.0)]
+    for facet in dict.fromkeys(spec.facet and law.where[spec.facet] for law in laws):
+        parts, members = list[Part](), [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
+        for law, colour in zip(members, cycle(COLOURS), strict=False):
+            lead = "".join(f"{_text(value)}: " for value in law.series.values())
+            name = lead + ("no law" if law.fit is None else slope_text(law.fit))
+            y = np.where(law.y_values > 0.0, law.y_values, np.nan)
+            ends = [] if law.fit is None else law.x_values[[law.fit.first, law.fit.last]]
+            parts += [
+                Line(law.x_values, y, colour=colour, width=0.0, marker="o", size=3.5),
+                Line(ends, ends if law.fit is None else law.fit(ends), name, colour),
+            ]
         x = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
-        # the lines of theory run on beyond the points
-        ends = (float(values.min()) / 2.0, float(values.max()) * 2.0) if len(values) else None
-        parts = [part for i, law in enumerate(members) for part in _law_parts(law, i)]
-        title, note = _panel_title(config, spec, facet), "" if len(values) else "nothing above zero to draw"
-        panels.append(Panel(x, Axis(value_label(spec.value), spec.value, True, ends), parts, title, note))
+        is_empty = all(np.isnan(part.y).all() for part in parts)
+        note = "nothing above zero to draw" if is_empty else ""
+        panels.append(
+            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _panel_title(config, spec, facet), note)
+        )
     seeds = config.sweep.seeds
     return panels, (
         f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines with their slopes: least "
-        f"squares over the filled points; hollow points lie outside the law's range; dashed: theory's slope, "
-        f"{spec.theory:g}. The table says why each law ends."
+        f"squares over the law's range; theory's slope is {spec.theory:g}. The table says why each law ends."
     )
-
-
-def _law_parts(law: Law, i: int) -> list[Part]:
-    """One line: points, fit, and theory's slope through the middle of the fit."""
-    colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
-    x, y, inside = law.x_values, law.y_values, law.in_range
-    lead = ", ".join(map(_text, law.series.values()))
-    lead = f"{lead}: " if lead else ""
-    outside = np.isfinite(y) & (y > 0.0) & ~inside
-    points = Line(x, y, colour=colour, width=0.0, marker=marker, size=6.0 if i == 0 else 3.5)
-    hollow = points._replace(x=x[outside], y=y[outside], fill="#FFFFFF")
-    if law.fit is None:
-        reasons = dict.fromkeys(law.stops[end].partition(":")[0] for end in ("below", "above"))
-        return [hollow._replace(name=f"{lead}no law ({', then '.join(reasons)})")]
-    ends = x[[law.fit.first, law.fit.last]]
-    centre, around = float(np.sqrt(ends[0] * ends[1])), np.array([x[0] / 10.0, x[-1] * 10.0])
-    slope = law.fit(centre) * (around / centre) ** law.theory
-    return [
-        hollow,
-        points._replace(x=x[inside], y=y[inside]),
-        Line(ends, law.fit(ends), f"{lead}{slope_text(law.fit)}", colour),
-        Line(around, slope, colour=colour, width=0.8, dashes="--"),
-    ]
 
 
 def slope_text(fit: PowerLawFit) -> str:

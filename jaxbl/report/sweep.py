@@ -23,7 +23,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .aggregates import Distinct, Groups, Rows, spread
+from .aggregates import Column, Distinct, Groups, Rows
 from .maps import best_gains, laws_of, slope_text, unit_of, worst_runs
 from .panels import SIDES
 
@@ -221,18 +221,9 @@ def _law_table(laws: list[Law]) -> ResultTable:
 def _metric_table(result: StudyResult) -> ResultTable:
     metrics = {f"{side}.{name}": metric for side, (name, metric) in product(SIDES, SIDE_METRICS.items())}
     metrics = {column: metric for column, metric in metrics.items() if column in result.columns}
-    rows = Rows(result, metrics)
-
-    def numbers() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for frame in rows:
-            for i, column in enumerate(metrics):
-                values = frame[column].to_numpy(float)
-                values = values[np.isfinite(values)]
-                yield np.full(len(values), i), values
-
-    quantiles = spread(numbers, len(metrics), (0.05, 0.5, 0.95)).quantiles.T
-    table = [
-        [column, *(None if np.isnan(value) else value for value in row), metric.unit, metric.doc]
-        for (column, metric), row in zip(metrics.items(), quantiles, strict=True)
-    ]
+    table, groups = [], Groups(Rows(result, metrics), [])
+    for name, metric in metrics.items():
+        numbers = Column([name], lambda frame, name=name: frame[name].astype(float).replace([np.inf, -np.inf], np.nan))
+        quantiles = groups.spread(numbers, (0.05, 0.5, 0.95)).quantiles[:, 0]
+        table.append([name, *(None if np.isnan(value) else value for value in quantiles), metric.unit, metric.doc])
     return ResultTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], table)
