@@ -11,17 +11,18 @@ import numpy as np
 from pandas import DataFrame, Series
 
 from jaxbl.files import to_jsonable
-from jaxbl.gains.error_system import ErrorSystemMap, list_conditions
+from jaxbl.gains.error_system import list_conditions
 from jaxbl.gains.verify import Verdict, sides_with_gain_axes
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
+from jaxbl.observer.conditions import judge_gains
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .error_plane import draw_worst_planes
-from .gain_plane import EXACT, condition_curves, usual_rule_curve
+from .gain_plane import EXACT, condition_curves, conditions_line, usual_rule_curve
 from .loop_gains import margin_table
 from .maps import cell_edges
-from .panels import BLUE, COLOURS, MARKERS, VERMILION, Axis, Figure, Line, Map, Panel, Part, Scale, cloud, literal, mark
+from .panels import BLUE, MARKERS, VERMILION, Axis, Figure, Line, Map, Panel, Part, Scale, cloud, literal, mark
 
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
@@ -30,10 +31,8 @@ _ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
 
 def draw_verdict(verdict: Verdict) -> list[Figure]:
     """All figures of a verification."""
-    summary, plane = verdict.summary, verdict.error_map
-    damping = [_damping(verdict)] if plane.boundary_by_damping else []
     levels = [_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)]
-    return [_atlas(verdict), *draw_worst_planes(summary["marks"]), *damping, *levels]
+    return [_atlas(verdict), *draw_worst_planes(verdict.summary["marks"]), *levels]
 
 
 def _mark_gains(verdict: Verdict) -> list[Line]:
@@ -44,11 +43,6 @@ def _mark_gains(verdict: Verdict) -> list[Line]:
             places.append((literal(gains["name"]), gains["alpha_ratio"], gains["lambda_ratio"]))
     pairs = zip(places, itertools.cycle(("*", *MARKERS)), strict=False)
     return [mark(x, y, name, marker, 12.0) for (name, x, y), marker in pairs]
-
-
-def _plane_axes(plane: ErrorSystemMap, ylabel: str = _LAMBDA) -> list[Axis]:
-    pairs = ((_ALPHA, plane.alpha), (ylabel, plane.lambda_))
-    return [Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in pairs]
 
 
 def _atlas(verdict: Verdict) -> Figure:
@@ -64,21 +58,9 @@ def _atlas(verdict: Verdict) -> Figure:
         f"Simulated ratio of successive velocity peaks over {plane.ratio.size} cells; every condition demands a λ above its "
         "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
-    return Figure("atlas", [Panel(*_plane_axes(plane), parts, title)], caption, height=5.2)
-
-
-def _damping(verdict: Verdict) -> Figure:
-    plane, parts = verdict.error_map, list[Part]()
-    for i, (damping, boundary) in enumerate(sorted({0.0: plane.boundary, **plane.boundary_by_damping}.items())):
-        name = "no friction (exact condition)" if damping == 0.0 else f"friction number {damping:g}"
-        least = np.where(boundary > 0.0, boundary, np.nan)
-        parts.append(Line(plane.alpha, least, name, COLOURS[i % len(COLOURS)], 2.0))
-    axes = _plane_axes(plane, "least λ / √f⁺ that shrinks the error")
-    caption = (
-        "Least λ at which the worst disturbance no longer enlarges a velocity error v, simulated with viscous friction. "
-        "The friction number is (friction / inertia) v / f⁺: friction shrinks large errors, not small ones."
-    )
-    return Figure("friction", [Panel(*axes, [*parts, *_mark_gains(verdict)])], caption)
+    pairs = ((_ALPHA, plane.alpha), (_LAMBDA, plane.lambda_))
+    axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in pairs)
+    return Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
 
 
 def _normalise(frame: DataFrame, side: str) -> tuple[Series, Series]:
@@ -130,44 +112,62 @@ def write_verdict(verdict: Verdict, folder: Path) -> str:
 
 
 def describe_verdict(verdict: Verdict) -> Result:
-    """Say whether the marked gains are safe, and which conditions are wrong."""
-    marks, levels = verdict.summary["marks"], verdict.summary["levels"]
+    """Say whether the study's own gains and the marked ones are safe, and which conditions are wrong."""
+    marks, levels, own = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
     exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
     failures = sum(entry["counterexamples"] for _, entry in exact)
     extent = (
         f"{levels[0]['cells']} cells of the error system and {sum(level['cells'] for level in levels[1:])} runs of the drive"
     )
+    missed = [f"the study's gains, {side}" for side, judged in own.items() if not judged["holds"]["exact"]]
     word, headline = "good", f"No counterexample to the exact gain condition in {extent}."
-    if unsafe:
-        word, headline = (
-            "failed",
-            f"Not safe: {'; '.join(unsafe)}. A disturbance within f⁺ can keep the error from dying out.",
-        )
-    elif marks:
-        headline = "The marked gains are safe: any disturbance within f⁺ dies out in finite time."
+    # marks are there to be compared; the answer is about the user's own gains, if there are any
+    if missed or (unsafe and not own):
+        word, names = "failed", "; ".join(missed or unsafe)
+        headline = f"Not safe: {names}. A disturbance within f⁺ can keep the error from dying out."
+    elif own or marks:
+        whose = "study's own" if own else "marked"
+        headline = f"The {whose} gains are safe: any disturbance within f⁺ dies out in finite time."
+        headline += f" Of those marked not safe: {'; '.join(unsafe)}." if unsafe else ""
     elif failures:
         word, headline = "doubtful", f"The observer failed in {failures} of {extent} although the exact gain condition held."
+    margins = [
+        (judged["lambda"] / least, f"the study's gains, {side}")
+        for side, judged in own.items()
+        if (least := judged["least_lambda"]["exact"])
+    ]
+    margins += [(gains["margin_exact"], gains["name"]) for gains in marks]
     figures = [
-        KeyFigure(f"× {gains['margin_exact']:.3g}", f"{gains['name']}: λ over the least that is safe (exact condition)")
-        for gains in marks[:4]
-        if gains["margin_exact"]
+        KeyFigure(f"× {margin:.3g}", f"{name}: λ over the least that is safe (exact condition)")
+        for margin, name in margins[:4]
+        if margin
     ]
     figures = figures or [
         KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the condition held")
         for level, entry in exact[:4]
     ]
     tables = [_level_table(level) for level in levels]
-    tables += [table for level in levels for table in _claimed_tables(level)]
     if marks:
         tables[:0] = [_mark_table(marks), *_disturbance_tables(marks)]
     if len(verdict.counterexamples):
         tables.append(_counterexample_table(verdict))
     if margins := verdict.summary["loop_margins"]:
         tables.append(margin_table(margins))
-    remarks = [*map(_mark_line, marks), *_level_lines(verdict)]
+    remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own.items()]
+    remarks += [*map(_mark_line, marks), *_level_lines(verdict)]
     title = verdict.config.title or "Gain conditions"
     return Result(title, word, headline, figures, remarks, verdict.config.notes, tables)
+
+
+def _judge_own_gains(verdict: Verdict) -> JsonObject:
+    """Judge the gains of the study itself, which the axes replace, at the largest f⁺ of all runs of the drive, by side."""
+    judged = {}
+    for side in sides_with_gain_axes(verdict.config):
+        gains, bounds = getattr(verdict.config.observer, side), verdict.levels["drive"][f"{side}.f_plus"]
+        if gains.lambda_ is not None and gains.alpha is not None:
+            judged[side] = judge_gains(gains.lambda_, gains.alpha, float(bounds[np.isfinite(bounds)].max()))
+    return judged
 
 
 def _level_lines(verdict: Verdict) -> Lines:
@@ -248,16 +248,6 @@ def _level_table(level: JsonObject) -> ResultTable:
     head = ["condition", "holds", "holds, but failed", "fails, but converged", "λ demanded / least: median", "largest",
             "at least"]  # fmt: skip
     return ResultTable(f"{name}: {level['cells']} {kind}, {level['converged']} converged", head, rows)
-
-
-def _claimed_tables(level: JsonObject) -> list[ResultTable]:
-    if not (inputs := level.get("claimed_bound", {}).get("by_input")):
-        return []
-    keys = "converged_runs", "true", "claimed", "too_small"
-    rows = [[*row["input"].values(), *(row[key] for key in keys)] for row in inputs]
-    heading = f"True and claimed bound by input: {level['level']}, {level['side']}"
-    head = [*inputs[0]["input"], "runs", "median true f⁺", "2 max |acceleration|", "share too small"]
-    return [ResultTable(heading, head, rows)]
 
 
 def _mark_table(marks: list[JsonObject]) -> ResultTable:

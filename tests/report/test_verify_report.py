@@ -1,5 +1,6 @@
 """The page and figures of a verification."""
 
+import dataclasses
 import shutil
 
 import numpy as np
@@ -9,8 +10,10 @@ from browser import check_figures, needs_chromium, open_pages
 from panel_parts import names_of, part_named
 from shared_results import VERIFY_STUDY
 
+from jaxbl.config import read_config
+from jaxbl.observer.conditions import judge_gains
 from jaxbl.report.results import write_report
-from jaxbl.report.verify import draw_verdict
+from jaxbl.report.verify import describe_verdict, draw_verdict
 from jaxbl.sweeps.engine import Engine
 
 
@@ -27,7 +30,6 @@ def test_figures(verify_report):
     assert list(drawings) == [
         "atlas",
         "error_planes",
-        "friction",
         "levels_motor",
     ]
     assert all(drawing.caption for drawing in drawings.values())
@@ -51,11 +53,24 @@ def test_every_run_is_a_dot_and_counterexamples_are_counted(verify_report):
 
 
 def test_page_and_lines(verify_report):
-    _, folder, result = verify_report
+    verdict, folder, result = verify_report
     page = (folder / "report.html").read_text()
-    for text in ("Counterexamples by cause", "True and claimed bound by input", "small gains", "Moreno-Osorio"):
+    for text in ("Counterexamples by cause", "small gains", "Moreno-Osorio"):
         assert text in page
-    assert (result.verdict, result.headline.partition(".")[0]) == ("failed", "Not safe: small gains")
+    # the answer is about the study's own gains
+    assert result.verdict == "good" and result.headline.startswith("The study's own gains are safe: ")
+    assert result.headline.endswith("Of those marked not safe: small gains.")
+    bound = verdict.levels["drive"]["motor.f_plus"].max()
+    least = judge_gains(4.0, 9.0, bound)["least_lambda"]["exact"]
+    assert result.key_figures[0] == (
+        f"× {4.0 / least:.3g}", "the study's gains, motor: λ over the least that is safe (exact condition)"
+    )  # fmt: skip
+    assert result.remarks[0].startswith(f"motor: f⁺ = {bound:.3g} rad/s² is the largest of all runs; the gains are safe.")
+    # smaller ones are not, which comes first
+    data = verdict.config.to_dict()
+    data["observer"]["motor"]["lambda"] = 0.5 * least
+    weak = describe_verdict(dataclasses.replace(verdict, config=read_config(data)))
+    assert weak.verdict == "failed" and weak.headline.startswith("Not safe: the study's gains, motor.")
     assert any("no counterexample to any condition" in line for line in result.remarks)
     assert any("failed although a condition held" in line and "Causes, by experiment" in line for line in result.remarks)
     (marked,) = [line for line in result.remarks if line.startswith("small gains")]
@@ -64,13 +79,13 @@ def test_page_and_lines(verify_report):
     assert ": safe: any disturbance within f⁺ dies out" in marked
     (table,) = [table for table in result.tables if table.heading.startswith("Gains that are not safe")]
     assert table.columns == ["", "small gains"] and table.rows[1][0] == "share of the time above α"
-    assert len(list((folder / "figures").glob("*.png"))) == 4
+    assert len(list((folder / "figures").glob("*.png"))) == 3
 
 
 @needs_chromium
 def test_the_page_in_a_browser(verify_report):
     with open_pages(verify_report[1] / "report.html") as (page,):
-        check_figures(page, 4)
+        check_figures(page, 3)
 
 
 def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_study, call, tmp_path, monkeypatch):
@@ -85,7 +100,7 @@ def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_st
     assert code == 0
     assert {path.stem for path in folder.glob("figures/*.png")} > {"atlas", "levels_motor"}
     assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "manifest.json"))
-    assert lines[0].startswith("✗ Failed: Not safe: small gains")
+    assert lines[0].startswith("✓ Good: The study's own gains are safe")
     assert lines[-1] == "results/study_verdict/report.html"
     # the second call says the same
     assert call("verify", "study.toml")[:2] == (0, lines)
