@@ -501,6 +501,11 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     # the second call computes nothing and says the same
     monkeypatch.setattr(Engine, "run", lambda *_: pytest.fail("a finished search simulates"))
     assert call("tune", "study.toml")[:2] == (0, lines)
+    # nor does plot, which needs the study
+    (folder / "report.html").unlink()
+    assert call("plot", "results/study_gains", "--config", "study.toml")[:2] == (0, lines)
+    with pytest.raises(InputError, match=r"results/study_gains: no study is kept beside tuning\.json; give it by --config"):
+        call("plot", "results/study_gains")
     # other commands may share the folder, another study may not
     assert call("simulate", "study.toml")[0] == 0
     write_study(tmp_path, tunable_study(margin_exact=1.5), "b.toml")

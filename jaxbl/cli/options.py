@@ -49,7 +49,7 @@ SchedulerOption = Annotated[
     str | None, option("ADDRESS", "Dask cluster that computes: tcp://HOST:PORT, its scheduler's .json file, or local:N")
 ]
 FORMATS = "CSV, Parquet, MATLAB or JSON file"
-ResultsArgument = Annotated[str, argument("DIR", "folder of a sweep, identify or diagnose")]
+ResultsArgument = Annotated[str, argument("DIR", "folder of results that a command wrote")]
 LogArgument = Annotated[Path, argument("LOG", FORMATS)]
 LogOutOption = Annotated[Path | None, option("DIR", "folder for the results [default: results/<log name>_<what it holds>]")]
 MaxTorqueOption = Annotated[float | None, option("N·m", "limit of the next experiment's input [default: the log's]")]

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from jaxbl.result import Result
     from jaxbl.sweeps.programs import Backend
     from jaxbl.sweeps.status import Status
-    from jaxbl.sweeps.sweep import StudyResult
 
 
 @with_changes
@@ -278,11 +277,6 @@ _SUMMARIES = {"tune": "tuning.json", "verify": "verdict.json"}
 """Files with the result of a command."""
 
 
-def _study_size(result: "StudyResult") -> dict[str, Any]:
-    """Return the size of a study as data."""
-    return {"title": result.config.title, "runs": result.runs, "finished": result.is_finished(result.runs)}
-
-
 def compute(
     context: typer.Context,
     config: Path,
@@ -304,15 +298,20 @@ def compute(
     with run_with_progress(context, config, folder, first="drawing"):
         card = jaxbl.describe(result)
         card = jaxbl.write_report(result, folder, replace(card, next_steps=steps(card, study, folder)))
-    return Outcome(card, folder, summary=_SUMMARIES.get(command) or _study_size(result))
+    summary = _SUMMARIES.get(command) or {
+        "title": study.title,
+        "runs": result.runs,
+        "finished": result.is_finished(result.runs),
+    }
+    return Outcome(card, folder, summary=summary)
 
 
 def plot(
     context: typer.Context,
     folder: FolderArgument,
-    config: Annotated[Path | None, option("CONFIG", "take title, notes and figures from this study")] = None,
+    config: Annotated[Path | None, option("CONFIG", "the study; a sweep's may have another title, notes, figures")] = None,
 ) -> Outcome:
-    """Draw figures and report of a sweep again from its stored points, without simulating.
+    """Draw figures and report of a sweep, tune or verify again from its stored points, without simulating.
 
     Example: jaxbl plot results/axis_map --config axis.toml
 
@@ -321,17 +320,21 @@ def plot(
     workers.start_jax()
     from jaxbl.sweeps.store import Store, identity
 
-    where, result = to_path(folder), jaxbl.open_study(folder)
+    where = context.params["out"] = to_path(folder)
+    for again, file in ((tune, "tuning.json"), (verify, "verdict.json")):
+        if (where / file).exists():
+            if config is None:
+                raise InputError(f"{folder}: no study is kept beside {file}; give it by --config")
+            # what is finished is not computed again
+            return again(context=context, config=config, changes=(), gains=None)
+    result = jaxbl.open_study(folder)
     make_folder(where, "copy it to where you may write, and plot that")
     if config is not None:
         study = jaxbl.read_config(config)
         if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = replace(result, config=study)
-    with run_with_progress(context, where, where, first="drawing"):
-        card = jaxbl.describe(result)
-        card = jaxbl.write_report(result, where, replace(card, next_steps=after_sweep(card, result.config, where)))
-    return Outcome(card, where, summary=_study_size(result))
+    return compute(context, where, result.config, lambda *_, **__: result, "sweep", after_sweep)
 
 
 def explore(

@@ -102,5 +102,6 @@ def test_command_leaves_a_verdict_counterexamples_figures_and_report(verified_st
     assert all((folder / name).is_file() for name in ("verdict.json", "counterexamples.parquet", "manifest.json"))
     assert lines[0].startswith("✓ Good: The study's own gains are safe")
     assert lines[-1] == "results/study_verdict/report.html"
-    # the second call says the same
+    # the second call says the same, and plot draws it again
     assert call("verify", "study.toml")[:2] == (0, lines)
+    assert call("plot", "results/study_verdict", "--config", "study.toml")[:2] == (0, lines)
