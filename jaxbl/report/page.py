@@ -72,7 +72,8 @@ def _card(result: Result, figure: str) -> str:
     verdict = f'<p class="verdict {result.verdict.split()[0]}">{VERDICTS[result.verdict]} {result.verdict.capitalize()}</p>'
     keys = "".join(f"<div><b>{escape(value)}</b> {escape(meaning)}</div>" for value, meaning in result.key_figures)
     steps = "".join(
-        f"<dt>{escape(step.answers)}</dt><dd><pre>{escape(step.command)}</pre></dd>" for step in result.next_steps
+        f"<dt>{'Or' if i else 'Next'}: {escape(step.answers)}</dt><dd><pre>{escape(step.command)}</pre></dd>"
+        for i, step in enumerate(result.next_steps)
     )
     texts = [verdict, f'<p class="answer">{escape(result.headline)}</p>', f'<div class="keys">{keys}</div>' if keys else ""]
     return f'<section class="card"><div>{"".join(texts)}{f"<dl>{steps}</dl>" if steps else ""}</div>{figure}</section>'

@@ -52,6 +52,12 @@ def describe_trial(trial: Trial) -> Result:
     elif metrics["finite"]:
         times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
+        reserves = ", ".join(
+            f"× {judged['largest_f_plus'] / judged['f_plus']:.3g} ({side})" if judged["holds"]["exact"] else f"none ({side})"
+            for side, judged in summary["conditions"].items()
+            if judged["f_plus"]
+        )
+        headline += f" What the gains allow f⁺ to grow: {reserves}." if reserves else ""
     ratios = {"motor": 1.0, "load": getattr(trial.config.drive, "gear_ratio", 1.0)}
     units = {"velocity": "rad/s", "torque": "N m"}
     errors = {(side, quantity): metrics[f"{side}.{quantity}_rmse"] for side in sides for quantity in units}

@@ -60,7 +60,9 @@ def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result
     remarks += (line for side, (best, _) in survey.best.items() for line in _best_lines(side, best))
     works = survey.diverged < survey.runs and all(survey.converged.values())
     works = works and all(best is not None for best, _ in survey.best.values())
-    verdict = "doubtful" if not finished else "good" if works else "failed"
+    # where gains are not varied, runs that fail are not what was sought
+    partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
+    verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
     figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
     details = [_describe_study(config, survey), *config.notes]
@@ -164,8 +166,12 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         count = f"{count} at {simulated} of {points} grid points ({percent(simulated / points)})"
         among = " on the coarse grid"
     even = survey.even or math.nan
-    shares = [f"the {side} observer converges in {100 * survey.converged[side] / even:.1f} %" for side in survey.sides]
-    return f"{count}: {' and '.join(shares)}{among}." if shares else f"{count}."
+    works = {side: ", with the best gains in all" for side, (best, _) in survey.best.items() if best is not None}
+    shares = [
+        f"the {side} observer converges in {100 * survey.converged[side] / even:.1f} %{among}{works.get(side, '')}"
+        for side in survey.sides
+    ]
+    return f"{count}: {'; '.join(shares)}." if shares else f"{count}."
 
 
 def _best_lines(side: str, best: BestGains | None) -> Lines:

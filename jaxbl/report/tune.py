@@ -206,6 +206,9 @@ def describe_tuning(tuning: Tuning) -> Result:
     elif "range" in matter:
         verdict, headline = "doubtful", f"Better gains may lie beyond the range searched; of those in it take {chosen}."
     certified = certificate_lines(summary)
+    reserves = {side: min(found["margins"].values()) for side, found in summary["verdict"].items()}
+    if thin := [f"{side} × {reserve:.3g}" for side, reserve in reserves.items() if reserve < _LEAST_RESERVE]:
+        verdict, headline = "doubtful", f"{headline} Little reserve until they fail or err twice as much: {', '.join(thin)}."
     if beaten := _better_gains(summary):
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
     remarks = [*doubts_among(summary["remarks"]), *_reasons(summary)]
@@ -220,6 +223,10 @@ def describe_tuning(tuning: Tuning) -> Result:
     title = tuning.config.title or "Gains"
     remarks = [*certified, *remarks] if is_refuted(summary) else [*remarks, *certified]
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
+
+
+_LEAST_RESERVE = 1.25
+"""Factor by which gains may change until they fail, below which the card says so: f⁺ of a machine is known to about this."""
 
 
 def _better_gains(summary: JsonObject) -> list[str]:

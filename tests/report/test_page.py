@@ -103,7 +103,10 @@ def test_page_of_a_sweep(tmp_path):
         motor__margin_alpha=lambda frame: frame[ALPHA],
     )
     found = write_report(result, tmp_path)
-    assert (found.verdict, found.headline) == ("good", "40 runs: the motor observer converges in 80.0 %.")
+    assert (found.verdict, found.headline) == (
+        "good",
+        "40 runs: the motor observer converges in 80.0 %, with the best gains in all.",
+    )
     assert found.key_figures == [
         ("2.66 rad/s", "motor: velocity error of the best gains, rms (alpha = 2.66, lambda = 2.71)"),
         ("× 2.66", "motor: change of these gains to fail or err twice as much; 4 of 20 gains are as good within 5 %"),
