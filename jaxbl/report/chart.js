@@ -121,7 +121,7 @@ class Chart {
       cursor: { x: false, y: false, points: { show: false }, dataIdx: () => null, drag: { x: true, y: true, dist: 8, uni: 12, setScale: false }, bind: { dblclick: () => () => this.zoom(null) } },
       series: [null, ...lines.map((line) => ({
         facets: ["x", "y"].map((scale) => ({ scale, auto: true })), stroke: line.colour ?? colour, width: line.dots ? 0 : line.width ?? 1.5, dash: line.dash, alpha: line.alpha ?? 1,
-        spanGaps: !line.sorted, gaps: (plot, i, first, last, gaps) => gaps, points: { show: false }, paths: line.dots ? dotsOf(this, line) : line.steps ? uPlot.paths.stepped({ align: 1 }) : pathOf(line),
+        spanGaps: !line.sorted, gaps: (plot, i, first, last, gaps) => gaps, points: { show: false }, paths: line.dots ? dotsOf(this, line) : pathOf(line),
       }))],
       hooks: { drawClear: [(plot) => this.behind(plot)], draw: [(plot) => this.above(plot)], setSelect: [(plot) => this.select(plot)] },
       // uPlot knows gaps as null

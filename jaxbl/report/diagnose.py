@@ -275,13 +275,9 @@ def _gap_lines(gap: JsonObject) -> Lines:
     place = f"On the last part of the log ({holdout['from']:.4g} to {holdout['to']:.4g} s), held out"
     if holdout["separate"]:
         place = f"On {Path(holdout['file']).name}"
-    errors = [
-        f"{change} ({rms_text(gap['noise_floor'][name])}; {rms_text(gap['expected'][name]['limit'])})"
-        for name, change in _changes(gap, gap["holdout_rmse_before"], gap["holdout_rmse_after"]).items()
-    ]
     window = holdout["window"]
-    how = "predicted one sample ahead" if not window else f"over windows of {window:.2g} s"
-    lines = [f"{place}, {how}, rms (noise; most that a complete model leaves): {', '.join(errors)}."]
+    how = "one sample ahead" if not window else f"over windows of {window:.2g} s"
+    lines = [f"{place}, the motion is predicted {how}."]
     if "after" in run:
         lines.append(f"In one free run: {'; '.join(_changes(gap, run['before'], run['after']).values())}.")
     elif run:
@@ -295,7 +291,7 @@ def rms_text(value: float | None) -> str:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines, where, gap = [], summary["where"], summary["gap"]
+    lines, where = [], summary["where"]
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
         lines += [f"Residual of the model as given: {side['sentence']}." for side in where.values()]
     remaining = [(name, torque) for name, torque in summary["rest"].items() if (torque["evidence"] or 0.0) > 0.0]
@@ -305,17 +301,6 @@ def _remarks(summary: JsonObject) -> Lines:
             f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({percent(torque['share'])} of the driving torque, "
             f"evidence {torque['evidence']:.3g} nats)."
         )
-    after = gap["holdout_rmse_after"]
-    if control := gap["controls"].get("wrong"):
-        errors, z = control["rmse"], control["z"]
-        channel = max(gap["expected"], key=lambda name: _ratio(errors[name], after[name]))
-        outcome = "diverges"
-        if errors[channel] is not None:
-            outcome = (
-                f"leaves {rms_text(errors[channel])} {gap['units'][channel]} in {channel} in place of "
-                f"{rms_text(after[channel])}; it is {abs(z):.1f} standard errors {'worse' if z > 0.0 else 'better'}"
-            )
-        lines.append(f"Control: the best model with another effect ({control['effect']}) {outcome}.")
     return [*lines, *summary["notes"]]
 
 

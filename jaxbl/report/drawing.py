@@ -156,8 +156,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     fit = _count_columns(below, figure.width)
     foot = _ROW * math.ceil(len(below) / fit) + 0.1 if below else 0.0
     canvas = Canvas(figsize=(figure.width, figure.height * rows + foot), layout="none")  # pyright: ignore[reportArgumentType]
-    widths = figure.widths or [1.0] * columns
-    grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*widths, *[0.035 * sum(widths)] * shared])
+    grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*[1.0] * columns, *[0.035 * columns] * shared])
     axes: list[Axes] = []
     axes_by_axis: dict[tuple[str, Axis], Axes] = {}
     for i, panel in enumerate(panels):
@@ -168,8 +167,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
         axes_by_axis |= {("x", panel.x): ax, ("y", panel.y): ax}
         axes.append(ax)
         _draw_panel(ax, panel)
-        wide = figure.width * widths[i % columns] / sum(widths)
-        above = 0.0 if below else _legend_above(ax, names[i], wide)
+        above = 0.0 if below else _legend_above(ax, names[i], figure.width / columns)
         ax.set_title(_plain(panel.title), loc="left", pad=6.0 + 72.0 * above)
         inner = {"x": i + columns < len(panels) and panels[i + columns].x == panel.x,
                  "y": i % columns > 0 and panels[i - 1].y == panel.y}  # fmt: skip
@@ -286,7 +284,7 @@ def _draw_line(ax: Axes, line: Line, layer: float) -> None:
         x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
         line = line._replace(x=x, y=y)
     look: Any = {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
-    (artist,) = ax.plot(line.x, line.y, drawstyle="steps-post" if line.steps else "default", **_line_look(line), **look)
+    (artist,) = ax.plot(line.x, line.y, **_line_look(line), **look)
     # one by one, markers would be larger than an image of them
     artist.set_rasterized(bool(line.marker) and len(line.x) > 800)
     centred: Any = {"ha": "center", "va": "center"}

@@ -32,8 +32,6 @@ def describe_identification(summary: JsonObject) -> Result:
         verdict = "doubtful"
         headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
     tables = [_parameter_table(summary, parameters)]
-    if "regression" in method:
-        tables.append(_regression_table(method["regression"]))
     if method["recursive"]:
         rows = [[name, *(sides[side] for side in SIDES)] for name, sides in method["recursive"].items()]
         columns = ["", *(f"by the {side}" for side in SIDES)]
@@ -158,9 +156,3 @@ def _parameter_table(summary: JsonObject, parameters: Mapping[str, Quantity]) ->
         return table
     rows = [[*row, *(profile or (None, None))] for row, profile in zip(table.rows, profiles, strict=True)]
     return ResultTable(title, [*table.columns, "by profile from", "to"], rows)
-
-
-def _regression_table(regression: JsonObject) -> ResultTable:
-    motion = "with the measured transmitted torque" if regression["measured_transmitted_torque"] else "at smoothed motion"
-    title = f"Least squares on the equations of motion, {motion}, up to {regression['bandwidth']:.3g} Hz"
-    return number_table(title, read_quantities(regression["parameters"]))

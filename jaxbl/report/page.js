@@ -16,10 +16,7 @@ const cellOf = (edges, value) => {
 /** What a panel has at a place, in pixels from its corner: lines of text, and of a point where it is. */
 const found = (panel, at, size) => {
   const axes = [panel.x, panel.y], [x, y] = axes.map(along), here = [x.value(at[0] / size[0]), y.value(1 - at[1] / size[1])];
-  const said = (values, order = [0, 1]) => order.map((i) => saidOf(axes[i], values[i])).filter(Boolean);
-  const inside = (low, length, value) => (value - low) * (value - low - length) <= 0;
-  const bar = panel.bars.find(([left, bottom, width, height]) => inside(left, width, here[0]) && inside(bottom, height, here[1]));
-  if (bar) return { text: said([bar[0] + bar[2], bar[1] + bar[3] / 2], [1, 0]) };
+  const said = (values) => axes.map((axis, i) => saidOf(axis, values[i])).filter(Boolean);
   if (panel.cells) {
     const { edges, values, name } = panel.cells, [i, j] = edges.map((one, k) => cellOf(one, here[k]));
     // the point that the cell is drawn around
@@ -60,7 +57,7 @@ const figure = (element) => {
   const panels = JSON.parse(content.textContent).map(unpack), tools = made("div", { className: "tools" });
   const tool = (label, sign, act) => tools.append(button(sign, act, { title: label, ariaLabel: label }));
   // signals; what is written into other figures, such as names beside their curves, is in the picture alone
-  const isSignal = (panel) => !panel.cells && !panel.bars.length && !panel.x.log && panel.lines.length && panel.lines.every((line) => line.sorted);
+  const isSignal = (panel) => !panel.cells && !panel.x.log && panel.lines.length && panel.lines.every((line) => line.sorted);
   if (panels.length && panels.every(isSignal)) {
     const height = Number(image.getAttribute("height"));
     image.hidden = true;

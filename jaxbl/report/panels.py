@@ -71,7 +71,6 @@ class Line(NamedTuple):
         width: in points; 0 is no line.
         dashes: as matplotlib names them.
         marker, size, fill: of each point, by matplotlib's names; "" is none, and a `fill` of "" the line's colour.
-        steps: whether a value holds up to the next point.
         texts: words beside each point, or on it if there is no marker.
         at_line: whether the name stands beside the line, too.
         held: whether points outside of the axes are drawn on their edge.
@@ -87,7 +86,6 @@ class Line(NamedTuple):
     size: float = 5.0
     fill: str = ""
     opacity: float = 1.0
-    steps: bool = False
     texts: Sequence[str] = ()
     at_line: bool = False
     held: bool = False
@@ -188,7 +186,6 @@ class Figure(NamedTuple):
     Attributes:
         name: of its file, without ending.
         width, height: of the figure, and of each row of panels, inches.
-        widths: of the columns, relative.
     """
 
     name: str
@@ -197,7 +194,6 @@ class Figure(NamedTuple):
     columns: int = 1
     width: float = 6.8
     height: float = 3.6
-    widths: Sequence[float] = ()
 
 
 def stack(name: str, panels: Sequence[Panel], caption: str, height: float = 1.7) -> Figure:
@@ -381,22 +377,18 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
             "label": axis.label.replace("\n", " "), "key": axis.key, "log": axis.log,
             "ends": [float(f"{end:.8g}") for end in drawn_ends],
         } | ({"names": [[place, text.replace("\n", ", ")] for place, text in axis.names]} if axis.names else {})  # fmt: skip
-    content |= {kind: [] for kind in ("lines", "bands", "spans", "bars")}
+    content |= {kind: [] for kind in ("lines", "bands", "spans")}
     for part in map(thin, panel.parts):
         if isinstance(part, Line):
-            look = {key: getattr(part, key) for key in ("name", "colour", "width", "dashes", "marker", "steps", "opacity")}
+            look = {key: getattr(part, key) for key in ("name", "colour", "width", "dashes", "marker", "opacity")}
             content["lines"].append(look | {"x": packed(part.x), "y": packed(part.y), "sorted": part.is_sorted})
         elif isinstance(part, Band):
             content["bands"].append(part._asdict() | {key: packed(getattr(part, key)) for key in ("x", "low", "high")})
         elif isinstance(part, Span):
             content["spans"].append(part._asdict())
-        elif isinstance(part, Bars):
-            bars = zip(part.places, part.lengths, strict=True)
-            corners = [(0.0, place - part.thickness / 2.0, length, part.thickness) for place, length in bars]
-            content["bars"] += [[float(f"{number:.6g}") for number in bar] for bar in corners if np.all(np.isfinite(bar))]
         elif isinstance(part, Dots):
             content["lines"].append({"name": "", "colour": FAINT, "width": 0, "x": packed(part.x), "y": packed(part.y)})
-        elif np.size(part.values) <= _MOST_CELLS:
+        elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
             cells = {key: packed(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
             scale = part.scale._asdict()
             content["cells"] = cells | {"name": scale.pop("label").replace("\n", " ")} | scale

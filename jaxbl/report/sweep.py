@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
@@ -24,7 +23,7 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Column, Distinct, Groups, Rows
-from .maps import best_gains, laws_of, slope_text, unit_of, worst_runs
+from .maps import best_gains, laws_of, slope_text, worst_runs
 from .panels import SIDES
 
 
@@ -65,8 +64,7 @@ def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result
     verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
     figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
-    details = [_describe_study(config, survey), *config.notes]
-    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, details)
+    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes)
 
 
 def _best_figures(side: str, best: BestGains | None, runs: pd.DataFrame) -> Iterator[KeyFigure]:
@@ -93,24 +91,6 @@ def _importance_table(side: str, ranked: list[AxisImportance]) -> ResultTable:
 
 def _share(share: tuple[float, float] | None) -> str:
     return "–" if share is None else f"{100 * share[0]:.0f} ± {100 * share[1]:.0f} %"
-
-
-_DRIVES = {"two_inertia": "a drive of two inertias", "rigid": "a rigid drive"}
-
-
-def _describe_study(config: Config, survey: "_Survey") -> str:
-    """Say what was varied, in a sentence."""
-    varied = []
-    for path, values in survey.values.items():
-        if not pd.api.types.is_numeric_dtype(values):
-            varied.append(f"{path} ({', '.join(map(str, values))})")
-        elif len(values) > 1:
-            ends = f"{values.min():.4g} to {values.max():.4g} {unit_of(config, path)}"
-            varied.append(f"{path} ({len(values)} values, {ends})")
-    over = f", over {', '.join(varied)}" if varied else ""
-    seeds = f", each with {config.sweep.seeds} sequences of encoder noise" if config.sweep.seeds > 1 else ""
-    run = f"{config.run.duration:g} s, sampled every {1e3 * config.run.sample_period:g} ms"
-    return f"Studied: {_DRIVES[config.drive.kind]} in runs of {run}{over}{seeds}."
 
 
 class _Survey:

@@ -21,9 +21,7 @@ from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
 from .panels import (
     BLUE,
-    GREEN,
     MARKERS,
-    ORANGE,
     SIDES,
     Axis,
     Figure,
@@ -72,11 +70,6 @@ def _map(tuning: Tuning, side: str) -> Figure:
     alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
     parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
-    for window in summary["stages"][1:2]:
-        left, right = np.array(window[side]["alpha_ratio"]) * bound
-        low, high = np.array(window[side]["lambda_ratio"]) * np.sqrt(bound)
-        corners = [left, right, right, left, left]
-        parts.append(Line(corners, [low, low, high, high, low], "first zoom", "#777777", 1.2, "--"))
     parts += [mark(row["alpha"], row["lambda"], name, marker, 8.0) for name, marker, row in _compared_gains(summary, side)]
     parts.append(mark(gains["alpha"], gains["lambda"], "tuned"))
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
@@ -123,12 +116,6 @@ def _limits(tuning: Tuning, side: str) -> Figure:
             missed = line["missed"].map(lambda names, name=name: name in names)
             parts += [Span(edges[first], edges[last], *look) for first, last in stretches(missed)]
         parts.append(Line(x, y, label, BLUE, 2.0))
-        if objective == "velocity":
-            chatter = line["chatter"].to_numpy(float)
-            with np.errstate(invalid="ignore"):
-                slow = np.sqrt(y**2 - chatter**2)
-            parts.append(Line(x, chatter, "its chatter, sample to sample", ORANGE, 1.2))
-            parts.append(Line(x, slow, "its slow part, the rest", GREEN, 1.2))
         parts.append(Span(gains[gain], gains[gain], width=0.8, dashes="-"))
         parts.append(mark(gains[gain], error, "tuned", held=False))
         smaller, larger = (_short(limit) for limit in limits["towards"][gain].values())
@@ -138,13 +125,8 @@ def _limits(tuning: Tuning, side: str) -> Figure:
         panels.append(Panel(axis, Axis(label, log=True), parts, title))
     caption = (
         f"{side}: what limits the gains: the error along each of them, with the other one as tuned, from the runs of all "
-        "maps (between two rows of a map, interpolated). "
+        "maps (between two rows of a map, interpolated)."
     )
-    if objective == "velocity":
-        caption += (
-            "Chatter is the rms change from sample to sample over √2; the slow part is the rest of the mean square, where "
-            "chatter is not above the error. "
-        )
     return Figure(f"limits_{side}", panels, caption, 2)
 
 

@@ -185,21 +185,7 @@ def _level_lines(verdict: Verdict) -> Lines:
             line += f"and the observer failed although a condition held: {counts}. Causes, by experiment: "
             line += ", ".join(f"{cause} ({count})" for cause, count in causes) + "."
         lines.append(line)
-    for level in levels[1:]:
-        if below := level.get("below_f_plus"):
-            lines.append(_below_line(verdict, level["side"], below))
     return lines
-
-
-def _below_line(verdict: Verdict, side: str, below: JsonObject) -> str:
-    runs = "" if below["runs"] == below["converged_runs"] else f" {below['runs']} of them were looked at:"
-    return (
-        f"{side}: {below['converged_runs']} runs converge though α is below the true f⁺, where no condition can hold.{runs} "
-        f"In {below['disturbance_exceeds']} the disturbance itself exceeds α, {100.0 * below['share_above_alpha']:.3g} % of "
-        f"the time at most. The largest excursion from zero is {below['excursion_predicted']:.3g} rad/s predicted, "
-        f"{below['excursion_simulated']:.3g} rad/s simulated; the velocity tolerance is "
-        f"{verdict.config.run.velocity_tolerance:.3g} rad/s."
-    )
 
 
 def _mark_line(gains: JsonObject) -> str:

@@ -107,15 +107,11 @@ def test_the_card_has_verdict_numbers_and_gap():
         "Not ruled out by this log in place of load.coulomb_friction: load.stribeck_friction (0.07).",
     ]
     lines = result.details
-    assert lines[0].startswith(
-        "On other.csv, over windows of 0.5 s, rms (noise; most that a complete model leaves): theta_e 0.1 -> 0.0011 rad "
-        "(0.001; 0.0012), theta_s "
-    )
+    assert lines[0] == "On other.csv, the motion is predicted over windows of 0.5 s."
     assert lines[1].startswith("In one free run: theta_e 0.1 -> 0.002 rad;")
-    assert (
-        "Control: the best model with another effect (load.stribeck_friction) leaves 0.006 rad in theta_s in place of "
-        "0.00022; it is 12.3 standard errors worse."
-    ) in lines
+    table = next(table for table in result.tables if table.heading == "Held-out data, rms")
+    assert table.columns[-1] == "load.stribeck_friction"
+    assert table.rows[0] == ["motor position", "rad", 0.1, 0.0011, 0.001, 0.012 * 0.1, 0.03]
     assert lines[-1] == "A note."
 
 

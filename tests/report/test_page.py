@@ -200,7 +200,6 @@ def signal_panel(top, label, slope):
         "width": 1.5,
         "dashes": "--",
         "marker": "",
-        "steps": False,
         "opacity": 1.0,
     }
     axis = {"log": False, "key": ""}
@@ -208,7 +207,6 @@ def signal_panel(top, label, slope):
         "place": [0.1, top, 0.8, 0.35],
         "title": "",
         "lines": [line],
-        "bars": [],
         "x": axis | {"label": "time (s)", "ends": [0.0, 10.0]},
         "y": axis | {"label": label, "ends": [0.0, 30.0], "key": "a.b"},
         "bands": [
