@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         ControllerState as ControllerState,
         Moves as Moves,
         Ramp as Ramp,
+        RecordedReference as RecordedReference,
         SineReference as SineReference,
         StateFeedback as StateFeedback,
         StepsReference as StepsReference,
@@ -106,7 +107,8 @@ _NAMES = {
     "chain": "Experiment Run Sample Signals State initial_state step",
     "config": "Config read_config",
     "control": (
-        "AbstractController AbstractReference Cascade ControllerState Moves Ramp SineReference StateFeedback StepsReference"
+        "AbstractController AbstractReference Cascade ControllerState Moves Ramp RecordedReference SineReference "
+        "StateFeedback StepsReference"
     ),
     "diagnosis.diagnose": "Diagnosis diagnose",
     "drive": "AbstractDrive DeadZone Encoders Initial LinearShaft Rigid SigmoidBacklash TwoInertia",

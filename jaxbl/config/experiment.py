@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BeforeValidator, create_model, model_validator
 
 from jaxbl.chain import Run
-from jaxbl.control import CONTROLLERS, REFERENCES
+from jaxbl.control import CONTROLLERS, REFERENCES, RecordedReference
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
@@ -27,36 +27,53 @@ from jaxbl.validation import table_error
 from .tables import Table, declare_key, table_for, tagged_union
 
 
-class RecordedTable(Table):
-    """Input from a CSV or Parquet file (or a log file of another kind), played back with zero-order hold."""
+class _FileTable(Table):
+    """A signal over time in a file."""
 
     kind: Literal["recorded"]
     file: str = declare_key("CSV or Parquet file; relative to the config file")
     time_column: str = declare_key("column of times in s", "t")
-    torque_column: str = declare_key("column of torques in N m", "u")
-    gain: float = declare_key("factor on the recorded torque", 1.0)
-
-    def build(self) -> Recorded:
-        times, torques = self._columns()
-        return Recorded(times=times - times[0], torques=torques, gain=self.gain)  # type: ignore[arg-type]
 
     @property
     def length(self) -> float:
         """Time from the first to the last value, s."""
-        times, _ = self._columns()
-        return float(times[-1] - times[0])
+        times, _ = self._load_columns()
+        return float(times[-1])
 
-    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times, s, and torques, N m, shape (rows,). Raises `InputError`."""
-        path = Path(self.file)
-        file = read_log_file(path, (self.time_column, self.torque_column))
+    def _load_columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times from the first one on, s, and the signal, shape (rows,). Raises `InputError`."""
+        path, column = (
+            Path(self.file),
+            next(value for name, value in self if name.endswith("_column") and name != "time_column"),
+        )
+        file = read_log_file(path, (self.time_column, column))
         times = file.load_numbers(self.time_column)
-        file.check_length(file.find_column(self.torque_column), len(times))
-        torques = file.load_numbers(self.torque_column)
+        file.check_length(file.find_column(column), len(times))
+        signal = file.load_numbers(column)
         if (np.diff(times) <= 0.0).any():
             row = int(np.argmax(np.diff(times) <= 0.0)) + 2
             raise InputError(f"{path}: column '{self.time_column}', data row {row}: times should increase")
-        return times, torques
+        return times - times[0], signal
+
+
+class RecordedTable(_FileTable):
+    """Input from a CSV or Parquet file (or a log file of another kind), played back with zero-order hold."""
+
+    torque_column: str = declare_key("column of torques in N m", "u")
+    gain: float = declare_key("factor on the recorded torque", 1.0)
+
+    def build(self) -> Recorded:
+        return Recorded(*self._load_columns(), gain=self.gain)  # type: ignore[arg-type]
+
+
+class RecordedReferenceTable(_FileTable):
+    """Reference from a file as that of a recorded input; a cubic spline joins its positions."""
+
+    position_column: str = declare_key("column of positions in rad, of the controlled side", "reference")
+    gain: float = declare_key("factor on the recorded position", 1.0)
+
+    def build(self) -> RecordedReference:
+        return RecordedReference.through(*self._load_columns(), gain=self.gain)
 
 
 def _table_of_kind(kind: str, cls: type) -> type[Table]:
@@ -70,7 +87,9 @@ ExcitationTable = tagged_union(
 )
 EffectTable = tagged_union(EFFECTS, lambda kind, cls: table_for(cls, partial(make_effect, kind), kind=kind), "kind")
 ControllerTable = tagged_union(CONTROLLERS, _table_of_kind, "kind")
-ReferenceTable = tagged_union(REFERENCES, _table_of_kind, "kind")
+ReferenceTable = tagged_union(
+    REFERENCES, lambda kind, cls: RecordedReferenceTable if kind == "recorded" else table_for(cls, kind=kind), "kind"
+)
 InitialTable = table_for(Initial)
 EncodersTable = table_for(Encoders)
 EquivalentControlTable = table_for(EquivalentControl)

@@ -133,7 +133,7 @@ def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[JsonObject, 
     data = _load(path)
     read.append(path)
     tune = data.get("tune")
-    for table in (data.get("excitation"), tune.get("holdout") if isinstance(tune, dict) else None):
+    for table in (data.get("excitation"), data.get("reference"), tune.get("holdout") if isinstance(tune, dict) else None):
         if isinstance(table, dict) and isinstance(table.get("file"), str):
             table["file"] = str((path.parent / table["file"]).resolve())
     return _merge_includes(data, str(path), path.parent, [*chain, path.resolve()], read)

@@ -115,15 +115,18 @@ class Config(Table):
         """Build the experiment that the config describes, with Python numbers as leaves.
 
         Raises:
-            InputError: a recorded input cannot be read, or ends before the run.
+            InputError: a recorded input or reference cannot be read, or ends before the run.
         """
-        table, run = self.excitation, self.run
-        # half a sample for the rounding of times, one for the last value's own hold
-        if table.kind == "recorded" and table.length < run.duration - 2.0 * run.sample_period:
-            raise InputError(
-                f"{table.file}: ends after {table.length:g} s, and the run only after {run.duration:g} s; "
-                f"run.duration should be at most {table.length:g}"
-            )
+        run = self.run
+        for table in (self.excitation, self.reference):
+            if table is None or table.kind != "recorded":
+                continue
+            # half a sample for the rounding of times, one for the last value's own hold
+            if table.length < run.duration - 2.0 * run.sample_period:
+                raise InputError(
+                    f"{table.file}: ends after {table.length:g} s, and the run only after {run.duration:g} s; "
+                    f"run.duration should be at most {table.length:g}"
+                )
         names = "drive", "initial", "excitation", "encoders", "observer", "equivalent_control", "run"
         return Experiment(
             **{name: getattr(self, name).build() for name in names},
@@ -268,7 +271,7 @@ def _paths_of_other_observers(config: Config) -> Iterator[str]:
 
 KIND_PATH = "observer.kind"
 """Path of the kind of observer, which an axis may vary."""
-_FIXED = ("kind", "law", "file", "time_column", "torque_column", "precision")
+_FIXED = ("kind", "law", "file", "time_column", "torque_column", "position_column", "precision")
 """Keys that no axis varies."""
 
 

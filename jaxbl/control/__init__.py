@@ -2,5 +2,15 @@
 
 from .base import CONTROLLERS, AbstractController, ControllerState, Feedback
 from .cascade import Cascade
-from .references import REFERENCES, AbstractReference, FunctionReference, Moves, Ramp, SineReference, StepsReference, Target
+from .references import (
+    REFERENCES,
+    AbstractReference,
+    FunctionReference,
+    Moves,
+    Ramp,
+    RecordedReference,
+    SineReference,
+    StepsReference,
+    Target,
+)
 from .state_feedback import StateFeedback

@@ -11,7 +11,9 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from jaxbl.drive.excitation import rounding_bound
 from jaxbl.drive.parameters import Scalar, ScalarArray, parameter
 from jaxbl.registry import Registry, check_module
 
@@ -114,3 +116,31 @@ class Moves(AbstractReference):
         s = jnp.minimum((cycles - move) * (self.duration + self.pause) / self.duration, 1.0)
         rise = s * s * s * (10.0 + s * (6.0 * s - 15.0))
         return self.distance * jnp.where(jnp.mod(move, 2.0) == 0.0, rise, 1.0 - rise)
+
+
+@REFERENCES.add
+class RecordedReference(AbstractReference):
+    """Recorded positions at times (s), joined by a cubic spline, which overshoots at steps; first and last one are held.
+
+    `cubics` are the coefficients of each interval, the highest power first.
+    """
+
+    name = "recorded"
+    times: Float[Array, " samples"]
+    cubics: Float[Array, "4 intervals"]
+    gain: Scalar = parameter("", "factor on the recorded position", default=1.0)
+
+    @classmethod
+    def through(cls, times: Any, positions: Any, gain: Scalar = 1.0) -> "RecordedReference":
+        """Make the reference that goes through positions (rad) at increasing times (s), two or more."""
+        from scipy.interpolate import CubicSpline  # slow to load
+
+        # JAX may compute in float32 here
+        return cls(times, CubicSpline(times, positions).c, gain)
+
+    def position(self, time):
+        index = jnp.searchsorted(jnp.asarray(self.times), time + 5e-7 + rounding_bound(time), side="right") - 1
+        index = jnp.clip(index, 0, self.cubics.shape[1] - 1)
+        s = jnp.clip(time, self.times[0], self.times[-1]) - jnp.asarray(self.times)[index]
+        cubic, square, slope, start = jnp.asarray(self.cubics)[:, index]
+        return self.gain * (start + s * (slope + s * (square + s * cubic)))

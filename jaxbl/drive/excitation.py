@@ -127,7 +127,7 @@ class Chirp(AbstractExcitation):
         return self.amplitude * jnp.sin(2.0 * jnp.pi * turns)
 
 
-def _rounding_bound(time: ScalarArray) -> ScalarArray:
+def rounding_bound(time: ScalarArray) -> ScalarArray:
     """Bound on the rounding error of a time (or a ratio of times) that is a multiple of a rounded period."""
     return 4.0 * float(jnp.finfo(jnp.result_type(time)).eps) * time
 
@@ -146,7 +146,7 @@ class _HeldLevels(AbstractExcitation):
     def find_index(self, time: ScalarArray) -> Array:
         """Index of the hold interval at a time; at an edge a little early, since rounding must not make it a sample late."""
         holds = time / self.hold
-        return jnp.floor(holds + 1e-4 + _rounding_bound(holds)).astype(jnp.int32)
+        return jnp.floor(holds + 1e-4 + rounding_bound(holds)).astype(jnp.int32)
 
 
 @EXCITATIONS.add
@@ -189,5 +189,5 @@ class Recorded(AbstractExcitation):
 
     def __call__(self, time):
         # half a microsecond of slack, as time stamps are rounded decimal numbers
-        index = jnp.searchsorted(self.times, time + 5e-7 + _rounding_bound(time), side="right") - 1
+        index = jnp.searchsorted(self.times, time + 5e-7 + rounding_bound(time), side="right") - 1
         return self.gain * self.torques[jnp.clip(index, 0)]

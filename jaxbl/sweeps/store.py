@@ -15,6 +15,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import jax
 import numpy as np
 import pandas as pd
 
@@ -68,16 +69,17 @@ def identity(config: Config, command: str = "sweep") -> str:
         # conditions are judged and marks drawn anew each time
         data.get("verify", {}).pop(key, None)
     _name_by_content(data["excitation"], config.excitation)
+    _name_by_content(data.get("reference"), config.reference)
     if config.tune is not None and "holdout" in data.get("tune", {}):
         _name_by_content(data["tune"]["holdout"], config.tune.holdout)
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _name_by_content(data: JsonObject, excitation: Any) -> None:
-    """Replace the file name of a recorded input by a hash of its samples, since the file's path decides no number."""
-    if excitation.kind == "recorded":
-        record = excitation.build()
-        data["file"] = hashlib.sha256(record.times.tobytes() + record.torques.tobytes()).hexdigest()
+def _name_by_content(data: Any, signal: Any) -> None:
+    """Replace the file name of a recorded signal by a hash of its samples, since the file's path decides no number."""
+    if signal is not None and signal.kind == "recorded":
+        arrays = (leaf.tobytes() for leaf in jax.tree.leaves(signal.build()) if isinstance(leaf, np.ndarray))
+        data["file"] = hashlib.sha256(b"".join(arrays)).hexdigest()
 
 
 def study_subject(config: Config) -> Subject:
