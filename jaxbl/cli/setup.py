@@ -204,7 +204,7 @@ def demo(
     Read on: README.md
     """
     config = _find_shipped_study("gain_map.toml")
-    return compute(context, config, read_study(context, config), jaxbl.sweep, "sweep", after_demo)
+    return compute(context, config, read_study(context, config), jaxbl.sweep, "map", after_demo)
 
 
 def _find_shipped_study(name: str) -> Path:

@@ -114,7 +114,7 @@ def sweep(
         check_figures(study, study.figures, Points(study).metrics)
         if dry_run:
             return _estimate_cost(study, chosen)
-    collect = functools.partial(compute, context, config, study, jaxbl.sweep, "sweep", after_sweep)
+    collect = functools.partial(compute, context, config, study, jaxbl.sweep, "map", after_sweep)
     if detach or share_numbers is not None:
         folder = folder_of(config, "map", out)
         with run_with_progress(context, config, folder) as progress:
@@ -211,8 +211,12 @@ def tune(
 
     Read on: docs/tutorial.md
     """
-    study = read_study(context, config)
-    return compute(context, config, study, jaxbl.tune, "tune", lambda card, _, folder: after_tuning(card, config, folder))
+
+    def steps(card: "Result", study: "Config", folder: Path):
+        # over many points none has gains of its own
+        return [] if study.tune and study.tune.axes else after_tuning(card, config, folder)
+
+    return compute(context, config, read_study(context, config), jaxbl.tune, "gains", steps)
 
 
 @with_changes
@@ -231,7 +235,7 @@ def verify(
     Read on: docs/theory.md
     """
     study = read_study(context, config)
-    return compute(context, config, study, jaxbl.verify, "verify", lambda card, *_: after_run(card, config))
+    return compute(context, config, study, jaxbl.verify, "verdict", lambda card, *_: after_run(card, config))
 
 
 def read_study(context: typer.Context, config: Path) -> "Config":
@@ -270,11 +274,8 @@ def _parse_change(text: str) -> tuple[str, Any]:
     return path, value
 
 
-_FOLDERS = {"sweep": "map", "tune": "gains", "verify": "verdict"}
-"""What the folder of a command holds, by its name."""
-
-_SUMMARIES = {"tune": "tuning.json", "verify": "verdict.json"}
-"""Files with the result of a command."""
+_SUMMARIES = {"gains": "tuning.json", "verdict": "verdict.json"}
+"""Files with the result of a command, by what its folder holds."""
 
 
 def compute(
@@ -282,23 +283,23 @@ def compute(
     config: Path,
     study: "Config",
     run: Callable[..., Any],
-    command: str,
-    steps: Callable[["Result", "Config", Path], Sequence[NextStep]] = lambda *_: (),
+    content: str,
+    steps: Callable[["Result", "Config", Path], Sequence[NextStep]],
 ) -> Outcome:
     """Run a command on a study that continues where an interrupted call stopped, write its report, and say what it took.
 
-    Folder, --overwrite, --backend and --scheduler are those of the call. `steps` says what to try next, by what was found,
-    the study and the folder.
+    Folder, --overwrite, --backend and --scheduler are those of the call. `content` ends the folder's name, `steps` says what
+    to try next, by what was found, the study and the folder.
     """
     options = context.params
-    folder = folder_of(config, _FOLDERS[command], options["out"])
+    folder = folder_of(config, content, options["out"])
     with run_with_progress(context, config, folder) as progress:
         passed_on = {name: options[name] for name in ("overwrite", "backend", "scheduler") if name in options}
         result = run(study, folder, progress=progress, **passed_on)
     with run_with_progress(context, config, folder, first="drawing"):
         card = jaxbl.describe(result)
         card = jaxbl.write_report(result, folder, replace(card, next_steps=steps(card, study, folder)))
-    summary = _SUMMARIES.get(command) or {
+    summary = _SUMMARIES.get(content) or {
         "title": study.title,
         "runs": result.runs,
         "finished": result.is_finished(result.runs),
@@ -334,7 +335,7 @@ def plot(
         if identity(study) != Store.open(where).manifest["identity"]:
             raise InputError(f"{config}: is not the study in {folder}; only title, notes and figures may differ")
         result = replace(result, config=study)
-    return compute(context, where, result.config, lambda *_, **__: result, "sweep", after_sweep)
+    return compute(context, where, result.config, lambda *_, **__: result, "map", after_sweep)
 
 
 def explore(

@@ -35,6 +35,7 @@ from .panels import (
     intervals,
     name_rows,
     place_words,
+    tick_text,
 )
 from .tune import error_label, for_title
 
@@ -115,7 +116,7 @@ def short_names(kinds: Sequence[str]) -> dict[str, str]:
 
 def _axis(config: Config, path: str, values: Sequence[Any]) -> Axis:
     """An axis with its values in words, evenly."""
-    texts = [f"{value:.4g}" if isinstance(value, int | float) else str(value) for value in values]
+    texts = [tick_text(value) if isinstance(value, int | float) else str(value) for value in values]
     return Axis(axis_label(config, path), path, ends=(-0.5, len(values) - 0.5), names=tuple(enumerate(texts)))
 
 
