@@ -65,10 +65,15 @@ _SETTINGS: Any = {
     "savefig.dpi": 150,
     "svg.fonttype": "path",
 }
-_INK = ((BLACK, "currentColor"), ("#ffffff", "var(--paper)"), ("#dddddd", "var(--grid)"))
+_NAME, _HALO = "#111111", "#fefefe"
+"""Of names that are written on lines."""
+_INK = (
+    (BLACK, "currentColor"), (_NAME, "currentColor"), ("#ffffff", "var(--paper)"), (_HALO, "var(--back)"),
+    ("#dddddd", "var(--grid)"),
+)  # fmt: skip
 """Colours of a drawing that follow the page's."""
-_DARK = """svg { color: #000000; --paper: #ffffff; --grid: #dddddd; fill: currentColor }
-@media (prefers-color-scheme: dark) { svg { color: #e8e8ea; --paper: transparent; --grid: #43464c } }
+_DARK = """svg { color: #000000; --paper: #ffffff; --back: #ffffff; --grid: #dddddd; fill: currentColor }
+@media (prefers-color-scheme: dark) { svg { color: #e8e8ea; --paper: transparent; --back: #17181b; --grid: #43464c } }
 </style>"""
 _LETTER, _ROW, _KEY = 0.075, 0.19, 0.5
 """Width of a letter of a legend, height of a row, and width of what stands before a name, inches."""
@@ -149,9 +154,9 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     names = [_legend_handles(panel) for panel in panels]
     scales = _scales(panels)
     shared = len(scales) == 1
-    # one legend for all panels where one of them has all names, and for maps
+    # one legend for all panels where one of them has all names, for maps, and where a second scale stands above
     below = dict(itertools.chain(*(handles.items() for handles in names)))
-    if not scales and len(below) > max(map(len, names)):
+    if not scales and len(below) > max(map(len, names)) and not any(panel.x.ratio for panel in panels):
         below = {}
     fit = _count_columns(below, figure.width)
     foot = _ROW * math.ceil(len(below) / fit) + 0.1 if below else 0.0
@@ -304,9 +309,9 @@ def _name_line(ax: Axes, line: Line) -> None:
         # in the middle of the curve's width: beside it a name may stand on another one
         i = inside[int(len(inside) * (0.45, 0.4, 0.6, 0.25, 0.5)[len(ax.texts) % 5])]
         name = ax.text(
-            float(x[i]), float(y[i]), _plain(line.name), fontsize=8.5, ha="center", va="center", zorder=6, color="#111111"
+            float(x[i]), float(y[i]), _plain(line.name), fontsize=8.5, ha="center", va="center", zorder=6, color=_NAME
         )
-        name.set_path_effects([withStroke(linewidth=2.5, foreground="#FEFEFE")])
+        name.set_path_effects([withStroke(linewidth=2.5, foreground=_HALO)])
 
 
 def _draw_band(ax: Axes, band: Band, layer: float) -> None:

@@ -9,7 +9,7 @@ from pandas import DataFrame
 from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
 from jaxbl.json_types import JsonObject
 
-from .panels import VERMILION, Array, Axis, Figure, Line, Panel, Part, arrange, cloud, literal
+from .panels import VERMILION, Array, Axis, Figure, Line, Panel, Part, arrange, literal
 
 _MOST_PEAKS = 40
 """Half cycles of the error that are drawn."""
@@ -53,8 +53,9 @@ def error_path(trace: DataFrame, side: str, judged: JsonObject) -> ErrorPath:
     return ErrorPath(error[drawn], slope[drawn], peaks, ratio, curve)
 
 
-def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> Figure:
-    """The error of an observer in its phase plane, and its peaks, beside the majorant of the proof.
+def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]:
+    """The error of an observer in its phase plane, and its peaks, beside the majorant of the proof; no figure where no two
+    peaks stand out from the chatter.
 
     Args:
         trace: of a run, with true values and estimates.
@@ -63,33 +64,32 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> Figure:
     """
     error, slope, peaks, ratio, curve = error_path(trace, side, judged)
     lambda_, alpha, bound = (judged[name] for name in ("lambda", "alpha", "f_plus"))
-    # a path that noise tangles would fill the plane: its points let the majorant be seen
-    path = Line(error, slope, "error", VERMILION, 1.2) if len(peaks) > 1 else cloud(error, slope, "error", opacity=0.25)
-    left, right, axis = [path], [], Axis("peak of |ė| (rad/s)")
+    if len(peaks) < 2:
+        return []
     peaks = np.abs(peaks)
-    if len(peaks):
-        ratios = peaks[1:] / peaks[:-1]
-        name = f"run: ratio {np.median(ratios):.3g} (median)" if len(ratios) else "run: no two peaks beyond the chatter"
-        right.append(Line(np.arange(len(peaks)), peaks, name, VERMILION, 0.0, marker="o", size=4.0))
-        axis = axis._replace(log=True, ends=(0.5 * peaks.min(), 3.0 * peaks.max()))
+    name = f"run: ratio {np.median(peaks[1:] / peaks[:-1]):.3g} (median)"
+    left = [Line(error, slope, "error", VERMILION, 1.2)]
+    right = [Line(np.arange(len(peaks)), peaks, name, VERMILION, 0.0, marker="o", size=4.0)]
+    axis = Axis("peak of |ė| (rad/s)", log=True, ends=(0.5 * peaks.min(), 3.0 * peaks.max()))
     if len(curve[0]):
         left.append(Line(*curve, "majorant (36)", width=1.0))
-        count = np.arange(max(len(peaks), 2))
+        count = np.arange(len(peaks))
         for name, factor, dashes in (("majorant (37)", ratio, "-"), ("exact worst case", judged["peak_ratio"], "--")):
             # a worst case that ends at once has no second peak
             if factor:
                 right.append(Line(count, peaks[0] * factor**count, f"{name}: ratio {factor:.3g}", width=1.0, dashes=dashes))
     plane = _plane(("position error e (rad)", "its slope ė (rad/s)"), left, (error, slope), curve)
-    note = "" if len(peaks) else "no peak stands out\nfrom the chatter"
     reason = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
-    return Figure(
-        f"error_plane_{side}",
-        [plane, Panel(Axis("half cycle"), axis, right, note=note)],
-        f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane, and its "
-        f"velocity peaks (analogue of Fig. 29). The majorant of the proof is for the worst disturbance within "
-        f"f⁺ = {bound:.3g} rad/s², without friction; a ratio below 1 proves convergence.{reason}",
-        columns=2,
-    )
+    return [
+        Figure(
+            f"error_plane_{side}",
+            [plane, Panel(Axis("half cycle"), axis, right)],
+            f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane, and its "
+            f"velocity peaks (analogue of Fig. 29). The majorant of the proof is for the worst disturbance within "
+            f"f⁺ = {bound:.3g} rad/s², without friction; a ratio below 1 proves convergence.{reason}",
+            columns=2,
+        )
+    ]
 
 
 def _plane(

@@ -70,7 +70,7 @@ def draw_residual(
         panels.append(Panel(x, y, [band, dots, *_means(coordinate)], f"explains {100.0 * coordinate.explained:.0f} %"))
     sentence = sentence_of(located, unit)
     caption = (
-        f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, black marks the means of bins "
+        f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, marks with strokes the means of bins "
         "with twice their standard errors; hollow where a mean does not differ significantly from zero. Above: share of the "
         "power beyond the noise that a function of this coordinate alone explains, on data that it was not fitted to."
     )

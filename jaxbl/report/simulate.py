@@ -1,5 +1,6 @@
 """What `jaxbl simulate` leaves to be read. The figures are analogues of figures of the paper."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from jaxbl.sweeps.trial import Trial
 from .error_plane import error_plane
 from .gain_plane import conditions_line, draw_gain_plane
 from .panels import (
-    BLACK,
     SIDE_COLOURS,
     SIDES,
     TIME,
@@ -24,7 +24,6 @@ from .panels import (
     Figure,
     Line,
     Panel,
-    cloud,
     stack,
 )
 
@@ -107,7 +106,7 @@ def draw_trial(trial: Trial) -> list[Figure]:
         figures.append(_compare("following", trace, name, "rad", target, {"true": (position, VERMILION)}, caption))
     judged = trial.summary["conditions"]
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
-    figures += [error_plane(trace, side, gains) for side, gains in judged.items()]
+    figures += itertools.chain(*(error_plane(trace, side, gains) for side, gains in judged.items()))
     return [*figures, _hysteresis(trace)] if len(sides) == 2 else figures
 
 
@@ -140,7 +139,7 @@ def _hysteresis(trace: DataFrame) -> Figure:
         Line(last["z"], last[f"{side}.torque_estimate"], f"by the {side} observer", SIDE_COLOURS[side], 1.6, opacity=0.75)
         for side in SIDES
     ]
-    loops.append(cloud(last["z"], last["torque"], "true", BLACK, opacity=1.0))
+    loops.append(Line(last["z"], last["torque"], "true", width=1.2))
     caption = (
         "Torque over twist in the second half of the run; chatter and lag of the estimates widen the loop (analogue of "
         "Fig. 17)."

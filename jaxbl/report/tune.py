@@ -39,7 +39,7 @@ from .panels import (
 
 def draw_tuning(tuning: Tuning) -> list[Figure]:
     """All figures of a tuning."""
-    return [draw(tuning, side) for side in SIDES if side in tuning.candidates for draw in (_map, _limits)]
+    return [draw(tuning, side) for draw in (_map, _limits) for side in SIDES if side in tuning.candidates]
 
 
 def error_label(summary: JsonObject) -> str:

@@ -133,7 +133,7 @@ def test_page_of_a_run_and_its_files(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == trial.summary
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), trial.trace)
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 8
+    assert len(page.images) == 7
     assert (tmp_path / "report.html").stat().st_size < 5e6
     assert HOSTILE in lines and HOSTILE in page.text
     for text in (lines[0], *lines[-2:], "half_gap", "rms velocity error"):
