@@ -715,7 +715,7 @@ def test_inspect_says_what_a_log_holds_and_leaves_numbers_figures_and_report(cal
     assert any(line.split(maxsplit=2)[-1] == "6000 samples every 1 ms, even stamps, 1 segment" for line in lines)
     assert any(line.startswith("As read: motor up to ") and "u up to " in line for line in lines)
     assert lines[-1] == "results/axis_inspected/report.html" and len(lines) <= 8
-    figures = {f"figures/{name}.png" for name in ("channels", "spectra", "torque_over_velocity", "twist")}
+    figures = {f"figures/{name}.png" for name in ("channels", "twist")}
     assert {"inspection.json", "report.html"} | figures <= set(list_files(folder))
     assert json.loads((folder / "inspection.json").read_text())["gear_ratio"] == pytest.approx(20.0, rel=1e-3)
     # again, and with a gear ratio that it contradicts

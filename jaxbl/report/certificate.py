@@ -88,21 +88,6 @@ def _lines(side: str, proof: JsonObject, passed_over: int) -> list[str]:
 
 
 def certificate_tables(summary: JsonObject) -> list[ResultTable]:
-    """The certificates' numbers and assumptions, if there are any."""
-    certificates = _proven(summary)
-    if not certificates:
-        return []
-    names = ["promised accuracy (rad/s)", "promised from (s)", "proven later (rad/s)", "that from (s)",
-             "worst found (rad/s)", "proven later / found", "found from (s)", "without noise, continuous (s)", "noise (rad)",
-             "f⁺ (rad/s²)", "period (s)", "velocity error at start (rad/s)", "position error at start (rad)"]  # fmt: skip
-    sides = [
-        [*(_above(proof[name]) for name in ("accuracy", "reaching_time", "final_accuracy")),
-         _above(proof["curve"]["time"][-1]), *(proof["search"][name] for name in ("worst", "ratio", "reaching_time")),
-         proof["reaching_time_continuous"],
-         *(proof["assumptions"][name] if name == "period" else _below(proof["assumptions"][name])
-           for name in ("noise", "f_plus", "period", "velocity_error", "position_error"))]
-        for proof in certificates.values()
-    ]  # fmt: skip
-    columns, rows = ["", *certificates], list(zip(names, *sides, strict=True))
-    table = ResultTable("Certificates: proven for any noise and disturbance within the bounds", columns, rows)
-    return [table, ResultTable("What the certificates assume", ["assumption"], [[line] for line in ASSUMPTIONS])]
+    """What the certificates assume, if there are any."""
+    assumptions = [[line] for line in ASSUMPTIONS]
+    return [ResultTable("What the certificates assume", ["assumption"], assumptions)] if _proven(summary) else []

@@ -28,7 +28,6 @@ from jaxbl.json_types import JsonObject
 
 from .panels import (
     BLACK,
-    FAINT,
     MISSING,
     Axis,
     Band,
@@ -249,7 +248,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
         _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
-    ax.grid(not any(isinstance(part, Map) for part in panel.parts) and panel.note == "")
+    ax.grid(not any(isinstance(part, Map) for part in panel.parts))
     for name, axis in zip("xy", panel[:2], strict=True):
         drawn = getattr(ax, f"{name}axis")
         if axis.names:
@@ -262,10 +261,6 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
             drawn.set_major_locator(MaxNLocator(ticks[name], steps=[1, 2, 5, 10]))
         if axis.ratio is not None:
             _draw_ratio(ax, name, *axis.ratio)
-    if panel.note:
-        ax.text(0.5, 0.5, _plain(panel.note), ha="center", va="center", color=FAINT, transform=ax.transAxes)
-        if not panel.parts:
-            ax.set(xticks=[], yticks=[])
 
 
 def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:

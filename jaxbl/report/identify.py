@@ -11,7 +11,6 @@ from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .numbers import lead_with_doubt, number_figures, number_table, write_fit
-from .panels import SIDES
 
 
 def write_identification(result: Identification, folder: Path) -> str:
@@ -21,7 +20,7 @@ def write_identification(result: Identification, folder: Path) -> str:
 
 def describe_identification(summary: JsonObject) -> Result:
     """Say whether the model explains the log, and which numbers it has, from an `identification.json`."""
-    method, parameters = summary["method"], read_quantities(summary["parameters"])
+    parameters = read_quantities(summary["parameters"])
     numbers = {path: number for path, number in parameters.items() if number.is_finite}
     complete = all(is_complete for is_complete, _ in _residuals(summary))
     size = "; ".join(f"{side}: {_size(residual)}" for side, residual in summary["residual"].items())
@@ -32,10 +31,6 @@ def describe_identification(summary: JsonObject) -> Result:
         verdict = "doubtful"
         headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
     tables = [_parameter_table(summary, parameters)]
-    if method["recursive"]:
-        rows = [[name, *(sides[side] for side in SIDES)] for name, sides in method["recursive"].items()]
-        columns = ["", *(f"by the {side}" for side in SIDES)]
-        tables.append(ResultTable("Recursive identification, at the end of the log", columns, rows))
     remarks = [*summary["warnings"], *_far_off(parameters)]
     if lacks := (summary.get("rejected") or {}).get("lacks"):
         remarks.append(

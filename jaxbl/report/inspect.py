@@ -9,7 +9,6 @@ from jaxbl.files import to_jsonable, write_json
 from jaxbl.lines import percent
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
-from jaxbl.records.signal_quality import low_pass
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .numbers import lead_with_doubt
@@ -17,20 +16,16 @@ from .panels import (
     BLACK,
     BLUE,
     COLOURS,
-    FAINT,
     GREEN,
     PURPLE,
     TIME,
     VERMILION,
-    ZERO,
     Axis,
     Figure,
     Line,
     Panel,
-    Span,
     cloud,
     join,
-    limits,
     stack,
 )
 
@@ -98,8 +93,6 @@ def draw_inspection(inspection: Inspection) -> list[Figure]:
     """All figures of an inspected log."""
     record = inspection.record
     figures = [_channels(record)]
-    if record.torque is not None and np.ptp(record.torque):
-        figures.append(_torque_over_velocity(record))
     if inspection.twist is not None:
         figures.append(_twist(inspection))
     return figures
@@ -123,32 +116,6 @@ def _channels(record: Record) -> Figure:
     ]
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
     return stack("channels", panels, caption, 1.5)
-
-
-def _torque_over_velocity(record: Record) -> Figure:
-    assert record.torque is not None
-    side, channels, dynamics = main_side(record), record.statistics.channels, record.statistics.dynamics
-    channel, period = channels[POSITION_CHANNELS[side]], record.sample_period
-    speed = compute_velocity(record, side)
-    torque, label, edge = record.torque.copy(), "torque u", 0
-    caption = "Torque over velocity: friction, as far as this log shows it."
-    if dynamics is not None and dynamics.values[0] > 4.0 * dynamics.errors[0] and dynamics.shares[0] > 0.05:
-        inertia, bandwidth = dynamics.values[0], 4.0 * channel.bandwidth
-        for segment in record.segments:
-            # the same low-pass as that of the acceleration
-            torque[segment] = low_pass(torque[segment], bandwidth, period)
-            torque[segment] -= inertia * np.gradient(speed[segment], period)
-        label = "u less inertia torque"
-        caption += f" Less the torque of an inertia of {inertia:.4g}: a rough estimate, not an identification."
-        # transients of the filter
-        edge = round(1.0 / (bandwidth * period))
-    inner = [slice(part.start + edge, part.stop - edge) for part in record.segments if part.stop - part.start > 4 * edge]
-    x, y = (np.concatenate([values[part] for part in inner or record.segments]) for values in (speed, torque))
-    # a few samples at sharp corners of the motion would set the scale
-    axis = Axis(f"{label} ({channels['u'].unit})", ends=limits(y, share=0.002, room=0.15))
-    across = Span(0.0, 0.0, colour=FAINT, width=0.8, dashes="-")
-    panel = Panel(Axis(f"{side} velocity ({channel.unit}/s)"), axis, [ZERO, across, cloud(x, y, colour=BLUE)])
-    return Figure("torque_over_velocity", [panel], caption)
 
 
 def _twist(inspection: Inspection) -> Figure:

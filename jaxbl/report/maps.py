@@ -517,11 +517,7 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
                 Line(ends, ends if law.fit is None else law.fit(ends), name, colour),
             ]
         x = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
-        is_empty = all(np.isnan(part.y).all() for part in parts)
-        note = "nothing above zero to draw" if is_empty else ""
-        panels.append(
-            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _panel_title(config, spec, facet), note)
-        )
+        panels.append(Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _panel_title(config, spec, facet)))
     seeds = config.sweep.seeds
     return panels, (
         f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines with their slopes: least "

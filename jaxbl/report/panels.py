@@ -171,13 +171,12 @@ Part = Line | Band | Span | Map | Dots | Bars
 
 
 class Panel(NamedTuple):
-    """One pair of axes: what is drawn, from behind to the front; a note in the middle where that is nothing."""
+    """One pair of axes: what is drawn, from behind to the front."""
 
     x: Axis
     y: Axis
     parts: Sequence[Part]
     title: str = ""
-    note: str = ""
 
 
 class Figure(NamedTuple):

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from pandas import DataFrame, Series
 
-from jaxbl.files import to_jsonable
 from jaxbl.gains.error_system import list_conditions
 from jaxbl.gains.verify import Verdict, sides_with_gain_axes
 from jaxbl.json_types import JsonObject
@@ -31,7 +30,7 @@ _ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
 
 def draw_verdict(verdict: Verdict) -> list[Figure]:
     """All figures of a verification."""
-    levels = [_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)]
+    levels = itertools.chain(*(_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)))
     return [_atlas(verdict), *draw_worst_planes(verdict.summary["marks"]), *levels]
 
 
@@ -69,8 +68,9 @@ def _normalise(frame: DataFrame, side: str) -> tuple[Series, Series]:
     return frame[f"observer.{side}.alpha"] / bound, frame[f"observer.{side}.lambda"] / np.sqrt(bound)
 
 
-def _levels(verdict: Verdict, side: str) -> Figure:
-    """The runs that converged and that failed, over the gains in units of each run's own true f_plus."""
+def _levels(verdict: Verdict, side: str) -> list[Figure]:
+    """The runs that converged and that failed, over the gains in units of each run's own true f_plus; nothing where no run
+    has a finite one, and a λ above 0."""
     wrong, places = verdict.counterexamples, {}
     if len(wrong):
         wrong = wrong[(wrong["side"] == side) & (wrong["bound"] == "true") & (wrong["condition"] == "exact")]
@@ -80,8 +80,7 @@ def _levels(verdict: Verdict, side: str) -> Figure:
         places[level] = gains[there], frame[f"{side}.converged"].to_numpy(bool)[there]
     ends = np.concatenate([gains for gains, _ in places.values()])
     if not len(ends):
-        panel = Panel(Axis(), Axis(), [], note="no run has a finite bound f⁺ and lambda > 0")
-        return Figure(f"levels_{side}", [panel], f"Runs of the drive, {side} observer: none to be drawn.")
+        return []
     (left, low), (right, high) = ends.min(axis=0) / 1.2, 1.2 * ends.max(axis=0)
     alphas, panels = (max(left, 1.0001), max(right, 1.001)), []
     for level, (gains, converged) in places.items():
@@ -99,7 +98,7 @@ def _levels(verdict: Verdict, side: str) -> Figure:
         f"Runs of the drive, {side} observer, each in units of its own true f⁺, on the axes of the atlas. A real input is "
         "not the worst disturbance: runs converge below the curves as well."
     )
-    return Figure(f"levels_{side}", panels, caption, len(panels), 4.4 * len(panels), 4.2)
+    return [Figure(f"levels_{side}", panels, caption, len(panels), 4.4 * len(panels), 4.2)]
 
 
 def _name(level: JsonObject) -> str:
@@ -149,9 +148,7 @@ def describe_verdict(verdict: Verdict) -> Result:
     ]
     tables = [_level_table(level) for level in levels]
     if marks:
-        tables[:0] = [_mark_table(marks), *_disturbance_tables(marks)]
-    if len(verdict.counterexamples):
-        tables.append(_counterexample_table(verdict))
+        tables.insert(0, _mark_table(marks))
     if margins := verdict.summary["loop_margins"]:
         tables.append(margin_table(margins))
     remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own.items()]
@@ -200,27 +197,6 @@ def _mark_line(gains: JsonObject) -> str:
     return f"{gains['name']}: {judged} (ratio of successive peaks ρ = {rho:.3g}); {here}."
 
 
-_OWN = {
-    "largest_disturbance": "largest disturbance (rad/s²)",
-    "share_above_alpha": "share of the time above α",
-    "excursion_predicted": "largest excursion, predicted (rad/s)",
-    "excursion_simulated": "simulated",
-    "largest_predicted": "largest peak, predicted (rad/s)",
-    "largest_simulated": "simulated",
-    "tenth_predicted": "peaks at a tenth after, predicted (s)",
-    "tenth_simulated": "simulated",
-    "least_simulated": "a sine upholds a limit cycle from (Hz)",
-}
-"""Numbers of what a run's own disturbance does to gains that miss the exact condition."""
-
-
-def _disturbance_tables(marks: list[JsonObject]) -> list[ResultTable]:
-    """Tables of what the run's own disturbance does to marked gains that miss the exact condition."""
-    judged = {gains["name"]: run | run["sine_cycle"] for gains in marks if (run := gains["on_this_disturbance"])}
-    rows = [[label, *(run.get(key) for run in judged.values())] for key, label in _OWN.items()]
-    return [ResultTable("Gains that are not safe, on the run's own disturbance", ["", *judged], rows)] * bool(judged)
-
-
 def _level_table(level: JsonObject) -> ResultTable:
     name, kind = "Normalised error system, worst disturbance", "cells"
     if level["level"] != "normalised":
@@ -252,13 +228,3 @@ def _mark_table(marks: list[JsonObject]) -> ResultTable:
     }
     rows = [[gains["name"], *(gains[key] for key in keys)] for gains in marks]
     return ResultTable("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
-
-
-def _counterexample_table(verdict: Verdict) -> ResultTable:
-    wrong = verdict.counterexamples[verdict.counterexamples["bound"] == "true"]
-    paths = [path for path in verdict.config.axis_paths if path in wrong]
-    keys = ["level", "side", "condition", "cause"]
-    parts = sorted(wrong.groupby(keys, sort=False), key=lambda pair: -len(pair[1]))
-    rows = [[*key, len(part), *(to_jsonable(part[path].iloc[0]) for path in paths)] for key, part in parts]
-    head = [*keys, "runs", *(f"e.g. {path}" for path in paths)]
-    return ResultTable("Counterexamples by cause (all of them, with all figures: counterexamples.parquet)", head, rows)

@@ -138,7 +138,7 @@ def test_report_has_every_number_and_figure(identification, tmp_path):
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "manifest.json", "report.html"}
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
-    assert drawn == {"intervals", "residuals", "velocities", "torque", "hysteresis", "limit_cycle", "recursive"}
+    assert drawn == {"intervals", "residuals", "hysteresis"}
     page = (tmp_path / "report.html").read_text()
     assert all(path in page for path in TRUTH)
 

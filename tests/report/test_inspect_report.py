@@ -16,14 +16,14 @@ from jaxbl.report.results import describe, write_report
 from jaxbl.result import format_result
 
 UNEVEN_TIMES = np.cumsum(1e-3 * np.random.default_rng(1).uniform(0.7, 1.4, 3000))
-BOTH_ENCODERS = ["channels", "torque_over_velocity", "twist"]
+BOTH_ENCODERS = ["channels", "twist"]
 CASES = {
     "both encoders": (simulate_log(count=6000, gap=0.1, noise=1e-3), {}, BOTH_ENCODERS),
     "uneven, with a gap": (simulate_log(UNEVEN_TIMES).drop(index=range(1000, 1400)), {}, BOTH_ENCODERS),
-    "motor alone": (simulate_log().drop(columns="theta_s"), {}, BOTH_ENCODERS[:2]),
-    "load alone, linear": (simulate_log().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH_ENCODERS[:2]),
-    "free": (simulate_log().assign(u=0.0), {}, ["channels", "twist"]),
-    "no torque": (simulate_log(), {"absent": ["u"]}, ["channels", "twist"]),
+    "motor alone": (simulate_log().drop(columns="theta_s"), {}, BOTH_ENCODERS[:1]),
+    "load alone, linear": (simulate_log().drop(columns="theta_e"), {"theta_s": {"unit": "m"}}, BOTH_ENCODERS[:1]),
+    "free": (simulate_log().assign(u=0.0), {}, BOTH_ENCODERS),
+    "no torque": (simulate_log(), {"absent": ["u"]}, BOTH_ENCODERS),
     "sensor": (simulate_log(), {"transmitted": "u"}, BOTH_ENCODERS),
     "noise": (simulate_log().assign(theta_e=np.random.default_rng(0).standard_normal(4000)), {}, BOTH_ENCODERS),
 }
@@ -81,7 +81,7 @@ def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):
     assert write_report(inspection, tmp_path / "out").sentences == describe(inspection).sentences
     page = (tmp_path / "out" / "report.html").read_text()
     Page(page)
-    assert page.count("<img") == 3
+    assert page.count("<img") == 2
     for text in ("What the log can identify", "Coulomb friction", "a&lt;b", "resolution"):
         assert text in page
     data = json.loads((tmp_path / "out" / "inspection.json").read_text())
@@ -93,7 +93,7 @@ def test_the_page_in_a_browser(tmp_path):
     simulate_log(gap=0.1).to_parquet(tmp_path / "log.parquet")
     write_report(inspect(tmp_path / "log.parquet", gear_ratio=GEAR_RATIO), tmp_path)
     with open_pages(tmp_path / "report.html") as (page,):
-        check_figures(page, 3)
+        check_figures(page, 2)
 
 
 def test_a_real_log_with_two_encoders(tmp_path):

@@ -261,7 +261,7 @@ def test_lines_with_a_theory_show_fit_range_and_slope(tmp_path):
         tmp_path, data, motor__velocity_rmse=lambda f: np.where(f[LAMBDA] == 1.0, 1e-5 * f[ALPHA], 0.0)
     )
     assert [panel.title for panel in drawing.panels] == ["λ, correction gain 1 √rad/s", "λ, correction gain 2 √rad/s"]
-    assert drawing.panels[1].note == "nothing above zero to draw"
+    assert names_of(drawing.panels[1]) == ["no law"]
 
 
 def test_figures_of_one_metric_get_names_of_their_own():
