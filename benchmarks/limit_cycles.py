@@ -93,6 +93,7 @@ class Events:
         twist = np.array([1.0, -loop.gear_ratio, 0.0, 0.0, 0.0, 0.0])
         self.twist, self.half_gap = twist, loop.half_gap
         self.generators, self.whole_steps = {}, {}
+        self.impacts = list[float]()  # relative speed, rad/s, at each closing of the gap
         for mode in (-1, 0, 1):
             # state: angles, speeds, torque, 1
             torque = 0.0 if mode == 0 else loop.stiffness * (twist - mode * loop.half_gap * np.eye(6)[5])
@@ -131,15 +132,20 @@ class Events:
                 return after
             event = brentq(distance, first, left, xtol=1e-15)
             state, left = expm(event * self.generators[mode]) @ state, left - event
+            if mode == 0:
+                self.impacts.append(abs(float(self.twist @ self.generators[0] @ state)))
         return state
 
 
 class Cycle(NamedTuple):
-    """Amplitude (rad) and frequency (Hz) of the load, and the amplitude in the quarter before."""
+    """Amplitude (rad) and frequency (Hz) of the load, the amplitude in the quarter before, and closings of the gap: their
+    rate in the last quarter (Hz), and the largest speed (rad/s)."""
 
     amplitude: float
     frequency: float
     before: float
+    impact_rate: float
+    impact_speed: float
 
 
 def simulate_events(loop: Loop) -> Cycle:
@@ -147,7 +153,10 @@ def simulate_events(loop: Loop) -> Cycle:
     drive = Events(loop)
     state = np.array([START, START / loop.gear_ratio, 0.0, 0.0, 0.0, 1.0])
     integral, speed, last, load = 0.0, 0.0, START, np.empty(STEPS)
+    before = 0
     for k in range(STEPS):
+        if k == 3 * STEPS // 4:
+            before = len(drive.impacts)
         load[k], motor = state[1], state[0]
         speed += PERIOD / (PERIOD + loop.speed_filter) * ((motor - last) / PERIOD - speed)
         wanted = loop.speed_gain * (-loop.position_gain * loop.gear_ratio * load[k] - speed)
@@ -162,17 +171,19 @@ def simulate_events(loop: Loop) -> Cycle:
     ups = np.flatnonzero((rest[:-1] <= 0.0) & (rest[1:] > 0.0))
     times = PERIOD * (ups - rest[ups] / (rest[ups + 1] - rest[ups]))
     frequency = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
-    return Cycle(0.5 * np.ptp(fourth), frequency, 0.5 * np.ptp(third))
+    rate = (len(drive.impacts) - before) / (0.25 * STEPS * PERIOD)
+    return Cycle(0.5 * np.ptp(fourth), frequency, 0.5 * np.ptp(third), rate, max(drive.impacts, default=0.0))
 
 
 def simulate_chain(loop: Loop) -> Cycle:
     """Simulate a closed loop by jaxbl: its metrics, and the trace for the quarter before."""
     experiment = loop.experiment()
-    names = ("limit_cycle_amplitude", "limit_cycle_frequency")
-    metrics = jaxbl.metrics(experiment, names=names)
+    names = ("limit_cycle_amplitude", "limit_cycle_frequency", "impact_rate")
+    metrics = jaxbl.metrics(experiment, names=(*names, "impact_speed"))
     load = np.asarray(jaxbl.simulate(experiment).load.true.position)
-    amplitude, frequency = (float(metrics[f"load.{name}"]) for name in names)
-    return Cycle(amplitude, frequency, 0.5 * np.ptp(load[STEPS // 2 : 3 * STEPS // 4]))
+    amplitude, frequency, rate = (float(metrics[f"load.{name}"]) for name in names)
+    before, speed = 0.5 * np.ptp(load[STEPS // 2 : 3 * STEPS // 4]), float(metrics["motor.impact_speed"])
+    return Cycle(amplitude, frequency, before, rate, speed)
 
 
 def is_at_border(loop: Loop, *cycles: Cycle) -> bool:

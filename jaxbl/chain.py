@@ -300,7 +300,7 @@ def step(experiment: Experiment, state: State, sample: Sample) -> tuple[State, S
             target = experiment.reference.target(sample.time)
         position = {side: sides[side].position_estimate for side in drive.sides}
         velocity = {side: sides[side].velocity_estimate for side in drive.sides}
-        feedback = Feedback(readings, position, velocity, filtered)
+        feedback = Feedback(readings, position, velocity, filtered, experiment.effects)
         control = experiment.controller.step(control, feedback, target, drive, period)
     return State(after, observers, filtered, identifier, controller=control), Signals(
         sample.time, torque_in, twist, torque, sides.pop("motor"), sides.pop("load", None), sides, target

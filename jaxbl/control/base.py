@@ -10,8 +10,10 @@ from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
+from jaxbl.drive.effects.base import AbstractEffect, Motion
 from jaxbl.drive.parameters import Scalar, ScalarArray, option, parameter
 from jaxbl.drive.plant import AbstractDrive
 from jaxbl.registry import Registry, check_module
@@ -26,12 +28,14 @@ class Feedback(NamedTuple):
         measured: readings, rad; a missed one is replaced by the observer's prediction.
         position, velocity: estimates of the observers, rad and rad/s.
         control: filtered equivalent control: the acceleration that the nominal model lacks, rad/s^2.
+        effects: those of the experiment, which a controller may know.
     """
 
     measured: dict[str, Any]
     position: dict[str, Any]
     velocity: dict[str, Any]
     control: dict[str, Any]
+    effects: tuple[AbstractEffect, ...] = ()
 
 
 class ControllerState(NamedTuple):
@@ -78,6 +82,27 @@ class AbstractController(eqx.Module):
             drive: nominal drive.
             period: sampling period, s.
         """
+
+    def effect_torque(
+        self, state: ControllerState, feedback: Feedback, target: Target, drive: AbstractDrive, period: Scalar
+    ) -> Any:
+        """Compute the torque (N m, on the motor side) that known effects on the sides resist when the next one acts.
+
+        Waves are taken at the readings, moved on to the middle of the torque's sample; friction, inertia and loads at the
+        target's velocity and acceleration. Effects with a memory or a clock are left out.
+        """
+        total = jnp.zeros_like(state.torque)
+        for effect in feedback.effects:
+            if effect.place not in drive.sides or effect.in_time or jax.tree.leaves(effect.init()):
+                continue
+            side = effect.place
+            turns = drive.ratio(self.side) / drive.ratio(side)
+            velocity = turns * target.velocity
+            motion = Motion(0.0, feedback.measured[side] + 1.5 * period * velocity, velocity, state.torque)
+            friction = jnp.sign(velocity) * effect.dry_friction((), motion)
+            inertia = turns * effect.added_inertia() * target.acceleration
+            total = total + (effect.resist((), motion) + friction + inertia) / drive.ratio(side)
+        return total
 
     def limit(self, last: Any, torque: Any, period: Scalar) -> ScalarArray:
         """Limit a torque (N m) in size, and in its change from the last one."""

@@ -22,7 +22,8 @@ class Cascade(AbstractController):
     Conf. (1989).
 
     `gap_compensation` is the inverse of a gap (rad, half of it, on the motor side): the motor's position is led by it in the
-    direction of the reference, and crosses the gap at `gap_speed` where that turns around.
+    direction of the reference, and crosses the gap at `gap_speed` where that turns around. From the observed twist, the
+    lead follows that at `gap_speed`, up to the gap: also of a load that runs ahead, and of a gap that is smaller.
     """
 
     name = "cascade"
@@ -39,11 +40,15 @@ class Cascade(AbstractController):
     viscous_feedforward: Scalar = parameter("N m s/rad", "viscous friction of feed-forward", default=0.0, minimum=0.0)
     friction_feedforward: Scalar = parameter("N m", "dry friction of feed-forward", default=0.0, minimum=0.0)
     gap_compensation: Scalar = parameter("rad", "half gap to compensate, on the motor side", default=0.0, minimum=0.0)
+    effects_feedforward: Scalar | None = parameter(
+        "", "share of the study's [[effects]] on the sides that is fed forward; left out: none", default=None, minimum=0.0
+    )
+    gap_from: Literal["reference", "twist"] = option("what says where in the gap the load is", default="reference")
     gap_speed: Scalar = parameter("rad/s", "motor speed at which the gap is crossed", default=10.0, above=0.0)
 
     @property
     def reads_observers(self):
-        return self.speed_from == "observer"
+        return self.speed_from == "observer" or self.gap_from == "twist"
 
     def start(self, measured):
         zero = jnp.zeros_like(measured["motor"])
@@ -58,16 +63,25 @@ class Cascade(AbstractController):
         else:
             speed = speed + period / (period + self.speed_filter) * ((reading - last) / period - speed)
         goal = jnp.where(target.velocity == 0.0, lead, self.gap_compensation * jnp.sign(target.velocity))
+        if self.gap_from == "twist":
+            twist = feedback.position["motor"] - drive.ratio("load") * feedback.position["load"]
+            goal = jnp.clip(twist, -self.gap_compensation, self.gap_compensation)
         crossing = jnp.clip(goal - lead, -self.gap_speed * period, self.gap_speed * period)
         error = ratio * (target.position - feedback.measured[self.side])
         if self.side == "motor":
             error = error + lead
-        speed_goal = self.position_gain * error + self.velocity_feedforward * ratio * target.velocity + crossing / period
+        speed_goal = (
+            self.position_gain * error
+            + self.velocity_feedforward * ratio * target.velocity
+            + (crossing / period if self.gap_from == "reference" else 0.0)
+        )
         if self.speed_limit is not None:
             speed_goal = jnp.clip(speed_goal, -self.speed_limit, self.speed_limit)
         proportional = self.speed_gain * (speed_goal - speed)
         feedforward = ratio * (self.inertia_feedforward * target.acceleration + self.viscous_feedforward * target.velocity)
         torque = proportional + integral + feedforward + self.friction_feedforward * jnp.sign(target.velocity)
+        if self.effects_feedforward is not None:
+            torque = torque + self.effects_feedforward * self.effect_torque(state, feedback, target, drive, period)
         limited = self.limit(state.torque, torque, period)
         if self.integral_time is not None:
             integral = integral + period / self.integral_time * (proportional + limited - torque)

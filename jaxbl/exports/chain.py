@@ -11,6 +11,7 @@ from jaxbl.chain import LONGEST_BLOCK, Experiment, Run, Sample, State, end_block
 from jaxbl.config import Config
 from jaxbl.control import Target
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, parameters, set_leaves
+from jaxbl.errors import InputError
 
 from .block import Block, Outputs, Port, Reference, StudyNumber, Values, trace_block
 from .lowering import default_precision
@@ -44,9 +45,15 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         config: the study.
         name: of the block, a C identifier.
         dtype: of its numbers.
+
+    Raises:
+        InputError: float, and the controller feeds effects forward.
     """
     with default_precision(dtype):
         experiment = as_arrays(config.build(), dtype)
+    # code in float knows positions only beside references that move along
+    if dtype == np.float32 and getattr(experiment.controller, "effects_feedforward", None) is not None:
+        raise InputError("precision: controller.effects_feedforward takes waves at whole angles; use 'double'")
     study_numbers = read_study_numbers(experiment)
     sides = experiment.sides
     positions = [Port(f"{side}_position", "rad", f"measured position of the {side}", dtype) for side in sides]

@@ -97,6 +97,12 @@ class SideSample(NamedTuple):
     """True if the following error is within tolerance."""
     period: Number = 0.0
     """Sampling period, s."""
+    twist: Number = 0.0
+    """Twist of the gear, rad on the motor side."""
+    twist_rate: Number = 0.0
+    """Its rate, rad/s."""
+    half_gap: Number = 0.0
+    """Half of the free play, rad on the motor side."""
 
 
 class SideEnd(NamedTuple):
@@ -314,6 +320,53 @@ class TorqueReversals(RunMetric):
         return carry[0] / (end.count * end.experiment.run.sample_period)
 
 
+class ImpactRate(RunMetric):
+    """Closings of the gap; the state is their number, the largest speed, and the last twist with its derivatives."""
+
+    name = "impact_rate"
+    unit = "Hz"
+    label = "gear impacts"
+    doc = "closings of the gap a second, in the last quarter"
+    better = "less"
+    carry = "impacts"
+    closed_loop = True
+
+    def applies(self, experiment):
+        return super().applies(experiment) and experiment.transmission is not None
+
+    def init(self, zero):
+        return (zero,) * 5
+
+    def update(self, carry, sample):
+        count, largest, twist, rate, acceleration = carry
+        was_free, is_free = jnp.abs(twist) < sample.half_gap, jnp.abs(sample.twist) < sample.half_gap
+        closes = (was_free | (twist * sample.twist < 0.0)) & ~is_free & (sample.half_gap > 0.0)
+        # free flight goes on up to the face; at the sample after, the contact has braked it
+        path = jnp.maximum(sample.half_gap - jnp.sign(rate) * twist, 0.0)
+        flight = jnp.minimum(path / jnp.maximum(jnp.abs(rate), 1e-12), sample.period)
+        mean = jnp.abs(rate + 0.5 * acceleration * flight)
+        flight = jnp.minimum(path / jnp.maximum(mean, 1e-12), sample.period)
+        speed = jnp.abs(rate + acceleration * flight)
+        largest = jnp.where(closes, jnp.maximum(largest, speed), largest)
+        acceleration = jnp.where(was_free & is_free, (sample.twist_rate - rate) / sample.period, 0.0)
+        return count + sample.inside * closes, largest, sample.twist, sample.twist_rate, acceleration
+
+    def result(self, carry, end):
+        return carry[0] / (end.count * end.experiment.run.sample_period)
+
+
+class ImpactSpeed(ImpactRate):
+    """Speed of the hardest closing of the gap."""
+
+    name = "impact_speed"
+    unit = "rad/s"
+    label = "gear impacts, speed"
+    doc = "largest relative speed of the faces as the gap closes, along the run, on the motor side"
+
+    def result(self, carry, end):
+        return carry[1]
+
+
 class LimitCycle(NamedTuple):
     """State of the limit cycle's metrics.
 
@@ -460,6 +513,8 @@ for _metric in (
     LimitCycleAmplitude,
     LimitCycleFrequency,
     TorqueReversals,
+    ImpactRate,
+    ImpactSpeed,
     Rms.of("torque_rms", "N m", "driving torque, rms",
            "rms torque that drives the side (motor: the input; load: through the gear)",
            better="less", closed_loop=True, signal=lambda _, sample: sample.driving_torque),
@@ -574,6 +629,11 @@ def _add_following(
     assert controller is not None and signals.target is not None and signals.torque is not None
     start = window_start(run.steps)
     error = signals.target.position * drive.ratio(controller.side) / drive.ratio(side) - sample.true.position
+    if experiment.transmission is not None:
+        true: Any = {name: signals.side(name).true for name in ("motor", "load")}
+        twist, rate = (experiment.plant.twist({k: getattr(v, n) for k, v in true.items()}) for n in ("position", "velocity"))
+        half_gap = experiment.transmission.half_gap + sum(effect.free_play() for effect in experiment.effects)
+        sample = sample._replace(twist=twist, twist_rate=rate, half_gap=half_gap)
     return sample._replace(
         following_error=error,
         driving_torque=signals.input if side == "motor" else drive.ratio(side) * signals.torque,
