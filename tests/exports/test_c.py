@@ -165,7 +165,7 @@ def test_a_controller_in_float_is_as_good_many_turns_away(tmp_path, kind):
 def test_waves_over_whole_angles_are_not_for_float(tmp_path):
     reference = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
     data = study("extended_state", controller=CONTROLLERS["knowing"], reference=reference)
-    with pytest.raises(jaxbl.InputError, match="precision: .*effects_feedforward takes waves at whole angles"):
+    with pytest.raises(jaxbl.InputError, match=r"precision: .*effects_feedforward takes waves at whole angles"):
         jaxbl.export(data, tmp_path / "out", precision="float")
 
 
