@@ -21,6 +21,7 @@ from jaxbl.chain import Experiment, NamedArrays, Sample, Signals, TracedArrays, 
 from jaxbl.config import ConfigSource, read_config
 from jaxbl.config.study import suggest_path
 from jaxbl.control import CONTROLLERS, REFERENCES, AbstractController, AbstractReference, FunctionReference
+from jaxbl.drive import DRIVES, AbstractDrive
 from jaxbl.drive.effects import EFFECTS, AbstractEffect
 from jaxbl.drive.excitation import EXCITATIONS, AbstractExcitation, FunctionInput
 from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
@@ -76,6 +77,7 @@ def experiment(study: ConfigSource | Experiment, *, precision: Literal["float64"
 
 
 _REGISTRIES: dict[type, Registry] = {
+    AbstractDrive: DRIVES,
     AbstractExcitation: EXCITATIONS,
     AbstractTransmission: TRANSMISSIONS,
     AbstractEffect: EFFECTS,
@@ -91,11 +93,11 @@ _Part = TypeVar("_Part", bound=type)
 def register(part: _Part) -> _Part:
     """Register a class of one's own under its `name`, for the studies of this process; a decorator.
 
-    Studies then take it as any other input, law, effect, observer, controller, reference or metric, at once and in the fused
-    loop. To define it again replaces it. Other processes need a package with an entry point (docs/effects.md).
+    Studies then take it as any other drive, input, law, effect, observer, controller, reference or metric, at once and in
+    the fused loop. To define it again replaces it. Other processes need a package with an entry point (docs/effects.md).
 
     Raises:
-        InputError: what is wrong with the class; a drive, which an :class:`Experiment` takes as it is.
+        InputError: what is wrong with the class.
     """
     cls: Any = part
     for base, registry in _REGISTRIES.items():
@@ -111,8 +113,7 @@ def register(part: _Part) -> _Part:
             jax.clear_caches()
             return part
     raise InputError(
-        f"register: {part!r} should be a class of an input, law, effect, observer, controller, reference or metric; a drive "
-        "of one's own goes into jaxbl.Experiment as it is"
+        f"register: {part!r} should be a class of a drive, input, law, effect, observer, controller, reference or metric"
     )
 
 

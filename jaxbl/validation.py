@@ -171,12 +171,17 @@ class StrictTable(BaseModel):
         """Refuse unknown keys. Turn arrays into lists, and NumPy's numbers into Python's."""
         if isinstance(data, Mapping):
             data = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in data.items()}
-            keys = [field.alias or name for name, field in cls.model_fields.items()]
+            keys = [*(field.alias or name for name, field in cls.model_fields.items()), *cls.further_keys()]
             for key in data:
                 if key not in keys:
                     hint = suggest_word(str(key), keys)
                     raise PydanticCustomError("unknown_key", "unknown key '{key}'; {hint}", {"key": key, "hint": hint})
         return data
+
+    @classmethod
+    def further_keys(cls) -> Collection[str]:
+        """Keys that a table may have beside its fields."""
+        return ()
 
 
 def table_error(message: str) -> PydanticCustomError:

@@ -8,12 +8,14 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import own_drive
 import pytest
 from markdown_blocks import read_blocks
 from scipy.integrate import solve_ivp
 
 import jaxbl
 from jaxbl.control import CONTROLLERS
+from jaxbl.drive import DRIVES
 from jaxbl.sweeps.engine import Engine
 
 ROOT = Path(__file__).parents[1]
@@ -34,6 +36,7 @@ def page():
                 assert block.text == printed
     yield names
     CONTROLLERS._members.pop("spring")
+    DRIVES._members.pop("three_inertia")
 
 
 def integrate(derivative, state, steps, period=1e-3):
@@ -133,30 +136,97 @@ def test_own_plant_against_scipy(page):
 
 
 def test_own_plant_in_the_fused_loop_and_the_scan(page):
-    values = {"drive.gear.half_gap": np.linspace(0.0, 0.05, 4)}
+    values = {"drive.half_gap": np.linspace(0.0, 0.05, 4)}
     by_scan = jaxbl.sweep_arrays(page["arm"], values, names=("velocity_rmse",), backend="scan")
     for column in by_scan.metrics:
         np.testing.assert_allclose(page["gaps"][column], by_scan[column], rtol=1e-9)
 
 
-def test_a_side_of_any_name(page):
-    class WithMiddle(page["ThreeInertia"]):
-        sides = ("motor", "middle", "load")
-        hidden = ()
+def test_own_plant_in_a_study_against_scipy(page):
+    """Motion, and the torque errors of a side on which no law of the package acts."""
+    trace, metrics = page["arm_run"].trace, page["arm_run"].summary["metrics"]
 
-    class ThreeObservers(jaxbl.Observers):
-        middle: jaxbl.AbstractObserver = jaxbl.ExtendedState(100.0)
+    def derivative(k, y):
+        before, behind = 50.0 * (y[0] - y[1]), dead_zone(y[1] - y[2], 30.0, 0.02)
+        return [*y[3:], (trace["u"][k] - before - 0.02 * y[3]) / 0.01,
+                (before - behind - 0.05 * y[4]) / 0.02, (behind - 0.1 * y[5]) / 0.05]  # fmt: skip
 
-    old = page["arm"]
-    drive = WithMiddle(*(getattr(old.drive, field.name) for field in dataclasses.fields(old.drive)))
-    experiment = jaxbl.with_values(old, {"drive": drive, "observer": ThreeObservers(old.observer.motor, old.observer.load)})
-    signals = jaxbl.simulate(experiment)
-    np.testing.assert_allclose(signals.motor.true.position, page["motion"].motor.true.position, rtol=1e-12)
-    error = signals.side("middle").true.velocity - signals.side("middle").velocity_estimate
-    assert np.sqrt(np.mean(np.square(error[500:]))) < 0.05 * np.ptp(signals.side("middle").true.velocity)
-    assert {"motor.velocity_rmse", "middle.velocity_rmse"} <= set(jaxbl.metrics(experiment, names=("velocity_rmse",)))
-    gaps = {"drive.gear.half_gap": [0.0, 0.02]}
-    assert jaxbl.sweep_arrays(experiment, gaps, names=("velocity_rmse",))["middle.velocity_rmse"].shape == (2, 1)
+    states = integrate(derivative, np.zeros(6), 2000)
+    np.testing.assert_allclose(trace["u"], np.sin(1.6 * np.pi * trace["t"]), atol=1e-12)
+    np.testing.assert_allclose(trace["motor.position"], states[:, 0], atol=1e-6)
+    np.testing.assert_allclose(trace["load.position"], states[:, 2], atol=1e-6)
+    torques = {"motor": 50.0 * (states[:, 0] - states[:, 1]), "load": dead_zone(states[:, 1] - states[:, 2], 30.0, 0.02)}
+    for side, torque in torques.items():
+        # the simulated one is the mean from a sample to the next, but for the change of friction in it
+        error = (0.5 * (torque[:-1] + torque[1:]) - trace[f"{side}.torque_estimate"][:-1])[1500:]
+        np.testing.assert_allclose(metrics[f"{side}.torque_rmse"], np.sqrt(np.mean(np.square(error))), rtol=0.02)
+
+
+def test_numbers_of_an_own_plant_are_checked(page):
+    study = page["arm_study"]
+    for drive, message in [
+        ({"half_gap": -1.0}, "drive.half_gap: should be greater than or equal to 0, not -1.0"),
+        ({"halfgap": 0.0}, "drive: unknown key 'halfgap'; did you mean 'half_gap'"),
+    ]:
+        with pytest.raises(jaxbl.InputError, match=message):
+            jaxbl.read_config(study | {"drive": study["drive"] | drive})
+    for table, message in [
+        ({"observer": {"motor": {"lambda": 1.0, "alpha": 1.0}}}, "observer.load is missing: a three_inertia drive has"),
+        ({"effects": [{"kind": "transmission.damping", "damping": 1.0}]}, "has no meaning on a three_inertia drive"),
+    ]:
+        with pytest.raises(jaxbl.InputError, match=message):
+            jaxbl.read_config(study | table)
+
+
+def test_logs_and_mujoco_refuse_an_own_plant_in_one_line(page, tmp_path):
+    study = page["arm_study"]
+    message = "drive.kind: logs are held against drives of kind two_inertia or rigid, not three_inertia"
+    for command in (jaxbl.identify, jaxbl.diagnose):
+        with pytest.raises(jaxbl.InputError, match=message) as caught:
+            command("log.csv", study)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(jaxbl.InputError, match="a MuJoCo model has one or two inertias, unlike three_inertia"):
+        jaxbl.export(study, tmp_path, "mjcf")
+
+
+def test_sides_of_any_name():
+    """Each of three encoders has noise, an observer, metrics and tuned gains; the fused loop is the scan."""
+    with own_drive.registered():
+        study = own_drive.STUDY
+        traces = [jaxbl.run(study, seed=1, backend=backend).trace for backend in ("fused", "scan")]
+        assert "theta_middle" in traces[0]
+        for column in traces[0]:
+            np.testing.assert_allclose(traces[0][column], traces[1][column], atol=1e-7 * max(1.0, np.ptp(traces[1][column])))
+        noise = {side: traces[0][f"theta_{end}"] - traces[0][f"{side}.position"]
+                 for side, end in (("motor", "e"), ("middle", "middle"), ("load", "s"))}  # fmt: skip
+        for values in noise.values():
+            np.testing.assert_allclose(np.std(values), 1e-5, rtol=0.15)
+        assert abs(np.corrcoef([*noise.values()]) - np.eye(3)).max() < 0.15
+
+        frame = jaxbl.sweep(study | {"axes": [{"path": "observer.middle.alpha", "values": [20.0, 60.0]}]}).frame
+        assert frame["middle.velocity_rmse"].nunique() == 2 and frame["load.velocity_rmse"].nunique() == 1
+        gains = jaxbl.tune(study | {"tune": {"num": 3, "refine": 0}}).summary["gains"]
+        assert set(gains) == set(own_drive.SIDES)
+        with pytest.raises(jaxbl.InputError, match="observer: unknown key 'midle'; did you mean 'middle'"):
+            jaxbl.read_config(study | {"observer": study["observer"] | {"midle": {"lambda": 1.0, "alpha": 1.0}}})
+
+    class MotorAlone(own_drive.ThreeSides):
+        name, sides, hidden = "motor_alone", ("motor",), ("middle", "load")
+
+    with own_drive.registered(MotorAlone):
+        alone = own_drive.STUDY | {"drive": {"kind": "motor_alone"} | own_drive.NUMBERS}
+        with pytest.raises(jaxbl.InputError, match="observer: unknown key 'middle'"):
+            jaxbl.read_config(alone)
+        alone["observer"] = {"motor": own_drive.STUDY["observer"]["motor"]}
+        np.testing.assert_allclose(jaxbl.run(alone).trace["motor.position"], traces[0]["motor.position"], rtol=1e-12)
+
+
+def test_an_own_plant_needs_a_motor():
+    class Headless(own_drive.ThreeSides):
+        name, sides = "headless", ("middle", "load")
+
+    with pytest.raises(jaxbl.InputError, match="register: Headless: its sides should have 'motor'"):
+        jaxbl.register(Headless)
 
 
 def test_metrics_are_those_of_a_run():

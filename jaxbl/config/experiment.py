@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, create_model, model_validator
+from pydantic import BeforeValidator, ConfigDict, create_model, model_validator
 
 from jaxbl.chain import Run
 from jaxbl.control import CONTROLLERS, REFERENCES, RecordedReference
+from jaxbl.drive import DRIVES, Initial
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.encoders import Encoders
 from jaxbl.drive.excitation import EXCITATIONS, Recorded
 from jaxbl.drive.parameters import config_key, parameters
-from jaxbl.drive.plant import DRIVES, Initial
 from jaxbl.drive.transmission import TRANSMISSIONS
 from jaxbl.errors import InputError
 from jaxbl.observer import DISCRETISATIONS, OBSERVERS, AbstractObserver, EquivalentControl, Identifier, Observers
@@ -103,7 +103,7 @@ _GAINS = {field.name: config_key(field.name) for cls in OBSERVERS.values() for f
 
 
 class _ObserverTable(Table):
-    """Observers of both sides."""
+    """Observers of both sides, and of further ones that a drive of one's own has."""
 
     discretisation: Literal[tuple(DISCRETISATIONS)] = declare_key(
         "of kind super_twisting. implicit: proximal backward Euler; explicit: forward Euler of (7)", "implicit"
@@ -117,8 +117,17 @@ class _ObserverTable(Table):
     def build(self) -> Observers:
         """The observers, without gains of other kinds."""
         names = [field.name for field, _ in parameters(self.observer)]
-        sides = (self.motor, self.load)
-        return Observers(*(s and self.observer(**{name: getattr(s, name) for name in names}) for s in sides))
+        sides = {"motor": self.motor, "load": self.load, **(self.model_extra or {})}
+        return Observers.of(
+            **{
+                side: gains and self.observer(**{name: getattr(gains, name) for name in names})
+                for side, gains in sides.items()
+            }
+        )
+
+    @classmethod
+    def further_keys(cls) -> set[str]:
+        return {side for drive in DRIVES.values() for side in drive.sides} - {*cls.model_fields}
 
 
 def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
@@ -135,7 +144,12 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
         "load": (gains | None, declare_key("gains of the load observer; none on a rigid drive", None)),
     }
     tag: Any = (Literal[kind], declare_key("kind of observer", kind if kind == _USUAL else ...))
-    return create_model(f"{cls.__name__}Table", __base__=_ObserverTable, __doc__=cls.__doc__, kind=tag, **sides)
+
+    class WithFurther(_ObserverTable):
+        model_config = ConfigDict(extra="allow")
+        __pydantic_extra__: dict[str, gains]
+
+    return create_model(f"{cls.__name__}Table", __base__=WithFurther, __doc__=cls.__doc__, kind=tag, **sides)
 
 
 _USUAL = "super_twisting"

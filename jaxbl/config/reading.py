@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+from jaxbl.drive import DRIVES
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.records import NominalDrive
@@ -77,6 +78,16 @@ _ELEMENT = (
 
 def _read_model_of_any_log(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     """Read a model as :func:`read_model` does, for any kind of log."""
+    config, missing = _fill_in_model(source)
+    if (kind := config.drive.kind) not in ("two_inertia", "rigid"):
+        raise InputError(
+            f"{source if isinstance(source, str | Path) else 'config'}: drive.kind: logs are held against drives of kind "
+            f"two_inertia or rigid, not {kind}; simulate, sweep, tune and export take it"
+        )
+    return config, missing
+
+
+def _fill_in_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     if isinstance(source, Config):
         return read_config(source), frozenset()
     name, data, origins = _read_with_includes(source)
@@ -88,8 +99,8 @@ def _read_model_of_any_log(source: ConfigSource) -> tuple[Config, frozenset[str]
         missing.add("excitation")
         data["excitation"] = {"kind": "sine", "amplitude": 0.0, "frequency": 1.0}
     drive, observer = data.get("drive"), data.setdefault("observer", {})
-    rigid = isinstance(drive, dict) and drive.get("kind") == "rigid"
-    for side in ("motor",) if rigid else ("motor", "load"):
+    kind = drive.get("kind") if isinstance(drive, dict) else None
+    for side in DRIVES[kind if kind in (*DRIVES,) else "two_inertia"].sides:
         if isinstance(observer, dict) and side not in observer:
             missing.add(f"observer.{side}")
             observer[side] = dict(_MISSING_GAINS)
@@ -123,7 +134,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None, None
     config, _ = _read_model_of_any_log(path)
-    ratio = None if config.drive.kind == "rigid" else config.drive.gear_ratio
+    ratio = getattr(config.drive, "gear_ratio", None)
     return config.log, ratio, config.nominal_drive()
 
 

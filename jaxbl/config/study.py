@@ -17,6 +17,7 @@ import tomli_w
 from pydantic import Field, model_validator
 
 from jaxbl.chain import Experiment, Run
+from jaxbl.drive import DRIVES, AbstractDrive
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
 from jaxbl.drive.parameters import Parameter, as_arrays, config_key, parameters
@@ -107,6 +108,16 @@ class Config(Table):
         return self
 
     @property
+    def sides(self) -> tuple[str, ...]:
+        """The sides of the drive that have an encoder and an observer."""
+        return DRIVES[self.drive.kind].sides
+
+    @property
+    def is_geared(self) -> bool:
+        """True if a transmission acts between motor and load that both have encoders."""
+        return self.transmission is not None and "load" in self.sides
+
+    @property
     def axis_paths(self) -> list[str]:
         """Paths of the axes, in their order."""
         return [axis.path for axis in self.axes]
@@ -132,7 +143,7 @@ class Config(Table):
             **{name: getattr(self, name).build() for name in names},
             transmission=None if self.transmission is None else self.transmission.build(),
             effects=tuple(effect.build() for effect in self.effects),
-            identifier=None if self.drive.kind == "rigid" else self.identifier.build(),
+            identifier=self.identifier.build() if self.is_geared else None,
             controller=None if self.controller is None else self.controller.build(),
             reference=None if self.reference is None else self.reference.build(),
         )
@@ -167,30 +178,31 @@ _MOST_SUBSTEPS = next(parameter.maximum for field, parameter in parameters(Run) 
 
 
 def _check_sides(config: Config) -> None:
-    """A rigid drive has no transmission and no load; a two-inertia drive needs both, and steps that resolve the gear."""
-    rigid = config.drive.kind == "rigid"
-    if rigid and config.transmission is not None:
-        raise table_error("[transmission] has no meaning on a rigid drive; remove it, or use drive.kind = 'two_inertia'")
-    if not rigid and config.transmission is None:
-        raise table_error("[transmission] is missing: a two_inertia drive needs one, such as law = 'dead_zone'")
+    """What is connected by a law needs one, each side its observer, and the gear steps that resolve it."""
+    kind, cls, rigid = config.drive.kind, DRIVES[config.drive.kind], "load" not in config.sides
+    if config.transmission is not None and "load" not in (*cls.sides, *cls.hidden):
+        raise table_error(f"[transmission] has no meaning on a {kind} drive; remove it, or use drive.kind = 'two_inertia'")
+    if config.transmission is None and not rigid and cls.body_torques is AbstractDrive.body_torques:
+        raise table_error(f"[transmission] is missing: a {kind} drive needs one, such as law = 'dead_zone'")
     compared_tables = () if config.tune is None else config.tune.compare
     gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(compared_tables)}
     for name, table in gains.items():
-        if rigid and table.load is not None:
-            raise table_error(f"{name}.load has no meaning on a rigid drive; remove it")
-        if not rigid and table.load is None:
-            raise table_error(f"{name}.load is missing: a two_inertia drive has a load observer; give its lambda and alpha")
+        given = {"motor", *(table.model_extra or {})} | (set() if table.load is None else {"load"})
+        for side in sorted(given - {*config.sides}):
+            raise table_error(f"{name}.{side} has no meaning on a {kind} drive; remove it")
+        for side in sorted({*config.sides} - given):
+            raise table_error(f"{name}.{side} is missing: a {kind} drive has a {side} observer; give its lambda and alpha")
     if rigid and config.controller is not None and config.controller.side == "load":
-        raise table_error("controller.side: 'load' has no meaning on a rigid drive; it should be 'motor'")
+        raise table_error(f"controller.side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
     certificate = None if config.tune is None else config.tune.certificate
     if rigid and certificate is not None and certificate.load is not None:
-        raise table_error("tune.certificate.load has no meaning on a rigid drive; remove it")
+        raise table_error(f"tune.certificate.load has no meaning on a {kind} drive; remove it")
     for i, mark in enumerate(config.verify.marks):
         if rigid and mark.side == "load":
-            raise table_error(f"verify.marks[{i}].side: 'load' has no meaning on a rigid drive; it should be 'motor'")
+            raise table_error(f"verify.marks[{i}].side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
     if config.transmission is not None:
-        rate = config.transmission.build().stiffness
-        rate *= 1.0 / config.drive.motor_inertia + config.drive.gear_ratio**2 / config.drive.load_inertia
+        drive, rate = config.drive.build(), config.transmission.build().stiffness
+        rate *= 1.0 / drive.inertia("motor") + drive.ratio("load") ** 2 / drive.inertia("load")
         # the scheme is stable while step * frequency < 2
         least_substeps = math.floor(config.run.sample_period * math.sqrt(rate) / 2.0) + 1
         if least_substeps > _MOST_SUBSTEPS:
@@ -207,17 +219,20 @@ def _check_sides(config: Config) -> None:
 
 def _check_effects(config: Config) -> None:
     """Effects act on what the drive has, their numbers agree, and they leave each side some inertia."""
-    rigid = config.drive.kind == "rigid"
+    drive = config.drive.build()
+    places = {*drive.bodies, "actuator", "encoder", *(() if config.transmission is None else ("transmission",))}
     for i, effect in enumerate(config.effects):
         place = effect.kind.partition(".")[0]
-        if rigid and (place == "transmission" or (place == "load" and "motor" in EFFECTS[effect.kind].places)):
+        twice = place == "load" and "load" not in drive.bodies and "motor" in EFFECTS[effect.kind].places
+        if twice or drive.resolve_place(place) not in places:
             raise table_error(
-                f"effects[{i}]: {effect.kind} has no meaning on a rigid drive; motor.* and actuator.* effects act on it"
+                f"effects[{i}]: {effect.kind} has no meaning on a {config.drive.kind} drive; motor.* and actuator.* effects "
+                "act on it"
             )
         if fault := EFFECTS[effect.kind].find_fault(effect.model_dump(), config.run.sample_period):
             raise table_error(f"effects[{i}]: {effect.kind}: {fault}")
-    for side in ("motor",) if rigid else ("motor", "load"):
-        nominal = getattr(config.drive, f"{side}_inertia")
+    for side in drive.bodies:
+        nominal = drive.inertia(side)
         heavier = [effect for effect in config.effects if effect.kind.partition(".")[0] == side]
         added = [float(effect.build().added_inertia()) for effect in heavier]
         if (total := nominal + sum(added)) <= 0.0:
@@ -250,13 +265,12 @@ def numeric_paths(config: Config) -> dict[str, Parameter]:
     for i, effect in enumerate(config.effects):
         label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
         parameters_by_path |= dict(_paths(effect, f"effects.{label}"))
-    if config.drive.kind == "rigid":
-        return {
-            path: parameter
-            for path, parameter in parameters_by_path.items()
-            if path.startswith("effects.") or ("load" not in path and not path.startswith("identifier."))
-        }
-    return parameters_by_path
+    return {
+        path: parameter
+        for path, parameter in parameters_by_path.items()
+        if path.startswith(("effects.", "drive."))
+        or (("load" in config.sides or "load" not in path) and (config.is_geared or not path.startswith("identifier.")))
+    }
 
 
 def _paths_of_other_observers(config: Config) -> Iterator[str]:
@@ -266,7 +280,7 @@ def _paths_of_other_observers(config: Config) -> Iterator[str]:
         yield "observer.discretisation"
     gains = {config_key(field.name) for field, _ in parameters(observer)}
     other_gains = {config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
-    yield from (f"observer.{side}.{key}" for side in ("motor", "load") for key in other_gains)
+    yield from (f"observer.{side}.{key}" for side in config.sides for key in other_gains)
 
 
 KIND_PATH = "observer.kind"
@@ -276,6 +290,8 @@ _FIXED = ("kind", "law", "file", "time_column", "torque_column", "position_colum
 
 
 def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
+    for side, gains in (table.model_extra or {}).items():
+        yield from _paths(gains, f"{prefix}.{side}")
     for name, field in type(table).model_fields.items():
         value = getattr(table, name)
         path = f"{prefix}.{field.alias or name}"

@@ -158,7 +158,8 @@ class FigureTable(Table):
                 raise table_error(f"{path} is used twice; x, y, facet and series should be different axes")
             if path in (self.where or {}):
                 raise table_error(f"{path} is drawn and cannot be fixed by where; leave it out of one of them")
-        gains = [{f"observer.{side}.alpha", f"observer.{side}.lambda"} for side in ("motor", "load")]
-        if self.overlays and {self.x, self.y} not in gains:
+        observer = self.x.rpartition(".")[0]
+        is_of_gains = observer.startswith("observer.") and {self.x, self.y} == {f"{observer}.alpha", f"{observer}.lambda"}
+        if self.overlays and not is_of_gains:
             raise table_error("overlays need a map over alpha and lambda of one observer; leave overlays out here")
         return self

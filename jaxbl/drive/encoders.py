@@ -29,11 +29,15 @@ class Encoders(eqx.Module):
             return self.noise
         return self.noise / ratio if self.load_noise is None else self.load_noise
 
+    def resolution_of(self, side: str) -> Scalar:
+        """Count of a side's encoder, rad; further sides have the load's."""
+        return self.motor_resolution if side == "motor" else self.load_resolution
+
     def measure(self, side: str, position: ScalarArray, unit_noise: ScalarArray, ratio: Scalar) -> ScalarArray:
         """Read a true position (rad).
 
         Args:
-            side: "motor" or "load".
+            side: of the encoder.
             position: true position, rad, as the effects of encoders change it.
             unit_noise: draw of a standard normal distribution, float32.
             ratio: motor angle for one unit of the side's angle.
@@ -42,7 +46,7 @@ class Encoders(eqx.Module):
             The reading, rad; NaN where it is missed.
         """
         noisy = position + self.noise_of(side, ratio) * unit_noise
-        resolution = self.motor_resolution if side == "motor" else self.load_resolution
+        resolution = self.resolution_of(side)
         count = jnp.where(resolution > 0.0, resolution, 1.0)
         reading = jnp.where(resolution > 0.0, count * jnp.round(noisy / count), noisy)
         if self.missed is None:

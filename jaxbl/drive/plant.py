@@ -22,6 +22,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxbl.registry import Registry, check_module
+
 from .effects import AbstractEffect, ActuatorEffect, EncoderEffect, Motion
 from .parameters import Scalar, ScalarArray, parameter
 from .transmission import AbstractTransmission
@@ -37,7 +39,7 @@ class AbstractDrive(eqx.Module):
 
     Attributes:
         name: key `kind` of the config.
-        sides: those with an encoder and an observer: "motor" and, on two inertias, "load".
+        sides: those with an encoder and an observer: "motor", on which the input acts, and, on two inertias, "load".
         hidden: further bodies of a drive of one's own, which no encoder sees.
     """
 
@@ -90,6 +92,17 @@ class AbstractDrive(eqx.Module):
         return (driving - self.viscous(side) * velocity) / self.inertia(side)
 
 
+def _check_drive(name: str, cls: Any) -> None:
+    check_module(name, cls, AbstractDrive)
+    if "motor" not in getattr(cls, "sides", ()):
+        raise ValueError("its sides should have 'motor', on which the input acts")
+
+
+DRIVES = Registry("jaxbl.drives", _check_drive)
+"""Drives by the key `kind` of the config, those of installed packages included."""
+
+
+@DRIVES.add
 class TwoInertia(AbstractDrive):
     """Motor and load, connected by a gear: J_e dv_e/dt = u - f_e v_e - C, J_s dv_s/dt = N_0 C - f_s v_s (1)."""
 
@@ -106,6 +119,7 @@ class TwoInertia(AbstractDrive):
         return 1.0 if side == "motor" else self.gear_ratio
 
 
+@DRIVES.add
 class Rigid(AbstractDrive):
     """One inertia: J_e dv_e/dt = u - f_e v_e - (effects). Effects of motor and load act on it; all else is disturbance."""
 
@@ -116,9 +130,6 @@ class Rigid(AbstractDrive):
 
     def resolve_place(self, place):
         return "motor" if place == "load" else place
-
-
-DRIVES: dict[str, type[AbstractDrive]] = {drive.name: drive for drive in (TwoInertia, Rigid)}
 
 
 class Initial(eqx.Module):

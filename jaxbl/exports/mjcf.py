@@ -11,6 +11,7 @@ from typing import Any
 
 from jaxbl.chain import Experiment
 from jaxbl.config import Config
+from jaxbl.drive import AbstractDrive
 from jaxbl.drive.parameters import parameters
 from jaxbl.errors import InputError
 from jaxbl.units import on_a_line
@@ -46,9 +47,13 @@ def write_mjcf(config: Config, *, linear: Iterable[str] = ()) -> tuple[str, floa
         linear: the sides (`motor`, `load`) that move along a line; they have slide joints, and kg, N, m.
 
     Raises:
-        InputError: no such side, or a transmission law that MuJoCo cannot say.
+        InputError: no such side, or a transmission law or drive of one's own that MuJoCo cannot say.
     """
     experiment, slides = config.build(), tuple(linear)
+    if type(experiment.drive).body_torques is not AbstractDrive.body_torques:
+        raise InputError(
+            f"drive.kind: a MuJoCo model has one or two inertias, unlike {config.drive.kind}; --target fmu has it"
+        )
     for side in slides:
         if side not in experiment.sides:
             raise InputError(f"linear: the drive has no side '{side}'; it should be among {', '.join(experiment.sides)}")

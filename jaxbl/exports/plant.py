@@ -84,7 +84,7 @@ def build_plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProg
         {path: (float(get_leaf(source, path)), parameter) for path, parameter in parameters_read.items()},
         frozenset(step_parameters),
         {
-            parameter.name: parameter.name.replace("motor_", "motor.").replace("load_", "load.")
+            parameter.name: re.sub(rf"^({'|'.join(experiment.sides)})_", r"\1.", parameter.name)
             for parameter in program.block.outputs
         },
     )

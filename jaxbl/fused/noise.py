@@ -36,26 +36,27 @@ def host_device() -> Any:
         return jax.local_devices()[0]
 
 
-def draw_noise(seed: int, first: int, count: int) -> NamedArrays:
+def draw_noise(seed: int, first: int, count: int, sides: tuple[str, ...] = SIDES) -> NamedArrays:
     """Draw the noise of each side `(count,)` for at most `LONGEST_SPAN` samples from `first` on."""
     size = max(LONGEST_SPAN // 4, 1 << (count - 1).bit_length())
-    return dict(zip(SIDES, np.asarray(_compile_noise(size)(seed, first, count))[:, :count], strict=True))
+    drawn = SIDES if {*SIDES}.issuperset(sides) else sides
+    return dict(zip(drawn, np.asarray(_compile_noise(size, drawn)(seed, first, count))[:, :count], strict=True))
 
 
 @cache
-def _compile_noise(size: int) -> Callable[[int, int, int], Any]:
+def _compile_noise(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
     """A function that draws the noise of at most `size` samples; compiled once for all studies."""
     with jax.default_device(host_device()):
         try:
-            return _compile_noise_by_loop(size)
+            return _compile_noise_by_loop(size) if sides == SIDES else _compile_noise_by_xla(size, sides)
         except Unsupported:
-            return _compile_noise_by_xla(size)
+            return _compile_noise_by_xla(size, sides)
 
 
-def _compile_noise_by_xla(size: int) -> Callable[[int, int, int], Any]:
+def _compile_noise_by_xla(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
     def draw(seed: Any, first: Any) -> Any:
-        by_side = unit_noise(seed, first + jnp.arange(size, dtype=jnp.int32), SIDES)
-        return jnp.stack([by_side[side] for side in SIDES])
+        by_side = unit_noise(seed, first + jnp.arange(size, dtype=jnp.int32), sides)
+        return jnp.stack([by_side[side] for side in sides])
 
     program = jax.jit(draw).lower(np.uint32(0), np.int32(0)).compile()
     return lambda seed, first, count: program(np.uint32(seed), np.int32(first))

@@ -46,13 +46,11 @@ class SharedPart(NamedTuple):
 
     def sample_inputs(self, seed: int, first: int, count: int) -> tuple[Any, Any]:
         """Indices and noise of samples, `(count,)` each."""
-        noise = draw_noise(seed, first, count)
+        noise = draw_noise(seed, first, count, self.sides)
         return np.arange(first, first + count, dtype=np.int32), {side: noise[side] for side in self.sides}
 
     def input_shapes(self, *shape: int) -> tuple[Any, Any]:
         """Shapes and types of `sample_inputs`."""
-        if not {"motor", "load"}.issuperset(self.sides):
-            raise Unsupported("sides other than motor and load")
         noise = jax.ShapeDtypeStruct(shape, jnp.float32)
         return jax.ShapeDtypeStruct(shape, jnp.int32), dict.fromkeys(self.sides, noise)
 

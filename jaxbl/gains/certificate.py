@@ -226,9 +226,9 @@ def choose_assumptions(search: GainSearch, side: str, f_plus: float) -> Assumpti
     `f_plus` is the largest one along the runs, rad/s^2.
     """
     config, pilot, side_table = search.scenarios.config, search.pilot[side], _side_table(search, side)
-    encoders = config.build().encoders
-    rms = float(encoders.noise_of(side, config.drive.gear_ratio if side == "load" else 1.0))
-    count = encoders.motor_resolution if side == "motor" else encoders.load_resolution
+    encoders = config.encoders.build()
+    rms = float(encoders.noise_of(side, config.drive.build().ratio(side)))
+    count = encoders.resolution_of(side)
     stated = side_table.model_dump(exclude={"accuracy", "reaching_time"}, exclude_none=True)
     f_plus = stated.get("f_plus", max(search.f_plus[side], f_plus, pilot["start"]))
     noise = stated.get("noise", 0.5 * float(count) + _NOISE_RMS_FACTOR * rms)

@@ -219,8 +219,8 @@ class _KindSearch:
             bound = point.pilot[side]["f_plus"]
             if not bound > 0.0:
                 raise no_disturbance_error(side)
-            encoders = config_there.encoders
-            noise = math.hypot(encoders.noise, _ROUNDING_RMS * getattr(encoders, f"{side}_resolution"))
+            encoders = config_there.encoders.build()
+            noise = math.hypot(encoders.noise, _ROUNDING_RMS * encoders.resolution_of(side))
             period = config_there.run.sample_period
             ranges = OBSERVERS[kind].gain_ranges(OperatingConditions(bound, period, noise))
             limits = {f"observer.{side}.{gain}": ends for gain, ends in ranges.items()}

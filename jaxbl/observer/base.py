@@ -7,7 +7,7 @@ packages add observers by the entry-point group `jaxbl.observers`; the entry poi
 
 import abc
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -158,3 +158,16 @@ class Observers(eqx.Module):
 
     motor: AbstractObserver
     load: AbstractObserver | None = None
+
+    @staticmethod
+    def of(**sides: AbstractObserver | None) -> "Observers":
+        """Return observers of any sides, by their names: a drive of one's own may have further ones."""
+        return _observers_with(tuple(side for side in sides if side not in ("motor", "load")))(**sides)  # type: ignore
+
+
+@cache
+def _observers_with(further: tuple[str, ...]) -> type[Observers]:
+    """The class whose fields are both sides and further ones: one for all experiments, as it is part of their programs."""
+    fields = {"__annotations__": dict.fromkeys(further, AbstractObserver), "__module__": __name__}
+    make: Any = type(Observers)
+    return make("Observers", (Observers,), fields | dict.fromkeys(further)) if further else Observers

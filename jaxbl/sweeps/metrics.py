@@ -604,7 +604,7 @@ def _update_carries(
         ratio = experiment.drive.ratio(side)
         position = true.position - s.position_estimate
         velocity = true.velocity - s.velocity_estimate
-        torque = signals.torque - s.torque_estimate
+        torque = _true_torque(experiment, side, signals) - s.torque_estimate
         within = (jnp.abs(position) * ratio <= run.position_tolerance) & (
             jnp.abs(velocity) * ratio <= run.velocity_tolerance
         )
@@ -619,6 +619,16 @@ def _update_carries(
             new_carry = jax.tree.map(functools.partial(jnp.where, is_final), carry, new_carry)
         new_carries[side] = new_carry
     return new_carries
+
+
+def _true_torque(experiment: Experiment, side: str, signals: Signals) -> Number:
+    """The torque that a side's equivalent control stands for, N m: where no law transmits it, all that acts on the side."""
+    if side == "motor" or experiment.transmission is not None:
+        return signals.torque
+    drive, true = experiment.drive, signals.side(side).true
+    assert true is not None
+    missing = true.acceleration - drive.acceleration(side, true.velocity, signals.input)
+    return drive.inertia(side) * missing / drive.torque_gain(side)
 
 
 def _add_following(
@@ -636,7 +646,7 @@ def _add_following(
         sample = sample._replace(twist=twist, twist_rate=rate, half_gap=half_gap)
     return sample._replace(
         following_error=error,
-        driving_torque=signals.input if side == "motor" else drive.ratio(side) * signals.torque,
+        driving_torque=signals.input if side == "motor" else drive.ratio(side) * _true_torque(experiment, side, signals),
         before=((index >= 2 * start - run.steps) & (index < start)).astype(signals.time.dtype),
         settled=jnp.abs(error) * drive.ratio(side) <= run.position_tolerance,
         period=run.sample_period,

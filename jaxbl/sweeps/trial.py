@@ -136,7 +136,7 @@ _REDUCERS = ALL_METRICS, _LAST_RESULTS
 def _trace_row(experiment: Experiment, state: State, signals: Signals) -> TracedArrays:
     """The trace's row of a sample, by column."""
     row = {"t": signals.time, "u": signals.input}
-    row |= {POSITION_CHANNELS[side]: signals.side(side).measured for side in experiment.sides}
+    row |= {POSITION_CHANNELS.get(side, f"theta_{side}"): signals.side(side).measured for side in experiment.sides}
     if signals.twist is not None:
         row["z"] = signals.twist
     row["torque"] = signals.torque

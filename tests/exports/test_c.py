@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import own_drive
 import pytest
 from native import COMPILERS, STRICT, UNCONTRACTED, Native, draw_samples, run_program, to_integers
 from small_study import small_study
@@ -267,6 +268,21 @@ def test_the_code_is_the_replay_of_a_record(tmp_path, law, explicit):
         tolerance = 1e-9 if not explicit else 2e-2
         computed, replayed = actual[:, names.index(name)], np.asarray(values)
         assert np.sqrt(np.mean((computed - replayed) ** 2)) <= tolerance * np.sqrt(np.mean(replayed**2)), name
+
+
+@pytest.mark.program("gcc")
+def test_a_drive_of_ones_own_with_three_encoders(tmp_path):
+    with own_drive.registered():
+        trace, native = jaxbl.run(own_drive.STUDY).trace, export_native(tmp_path, own_drive.STUDY)
+    columns = {f"{side}_position": f"theta_{side}" for side in own_drive.SIDES}
+    columns |= {"input": "u", "motor_position": "theta_e", "load_position": "theta_s"}
+    inputs = trace[[columns[port["name"]] for port in native.summary["inputs"]]].to_numpy()
+    outputs = run_native(native, inputs)
+    names = [output["name"] for output in native.summary["outputs"]]
+    for side in own_drive.SIDES:
+        # the run begins at the true position, the code at the first reading
+        expected, actual = trace[f"{side}.velocity_estimate"], outputs[:, names.index(f"{side}_velocity_estimate")]
+        np.testing.assert_allclose(actual[500:], expected[500:], atol=1e-3 * np.ptp(expected))
 
 
 @pytest.mark.program("gcc")
