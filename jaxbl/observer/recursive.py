@@ -51,13 +51,17 @@ class IdentifierState(NamedTuple):
     """State of the identifier, for n unknowns.
 
     Attributes:
+        near: where the first regressor was when it last moved.
+        stay: count of samples since then.
         regressors: filtered regressors, n numbers.
         information: upper triangle of the information matrix, n (n + 1) / 2 sums.
         right: n sums for each side.
         weight: the part of settled totals that forgetting has left.
-        most: largest determinant of the information matrix so far.
+        most: largest information on the first unknown so far.
     """
 
+    near: Number
+    stay: Number
     regressors: tuple[Number, ...]
     information: tuple[RunningSum, ...]
     right: dict[str, tuple[RunningSum, ...]]
@@ -66,8 +70,11 @@ class IdentifierState(NamedTuple):
 
 
 REMAINING = 0.01
-"""Least share of the most information that has to remain, for each unknown: that of a motion a tenth as large. Where
-forgetting has left less, as in a standstill, the numbers are those of noise."""
+"""Least share of the most information on the first unknown that has to remain: that of a motion a tenth as large. Where
+forgetting has left less, as in a noisy standstill, the numbers are those of noise."""
+LONGEST_STAY = 0.01
+"""Share of the memory that counts of a stay: a first regressor that moves too little to keep the information above that
+bound. All further samples say the same of the law and drive out what motion has told; friction at rest makes them wrong."""
 
 
 class Identifier(eqx.Module):
@@ -84,7 +91,8 @@ class Identifier(eqx.Module):
         n = len(law.regressors(zero))
         empty = RunningSum(zero, zero, zero)
         moments = dict.fromkeys(sides, (empty,) * n)
-        return IdentifierState((zero,) * n, (empty,) * (n * (n + 1) // 2), moments, jnp.ones_like(zero), zero)
+        sums = (empty,) * (n * (n + 1) // 2)
+        return IdentifierState(zero, zero, (zero,) * n, sums, moments, jnp.ones_like(zero), zero)
 
     def step(
         self,
@@ -111,18 +119,20 @@ class Identifier(eqx.Module):
         filtered = tuple(low_pass.filter(old, new, step) for old, new in zip(state.regressors, raw, strict=True))
         # the equivalent control at a sample balances the torque before it: it is one sample late, and so must phi be
         phi = state.regressors if self.regressor_filter == "matched" else raw
+        moved = (phi[0] - state.near) ** 2 > REMAINING * (1.0 - self.forgetting) * state.most
+        near, stay = jnp.where(moved, phi[0], state.near), jnp.where(moved, 0.0, state.stay + 1.0)
         # half a period of slack, as time is a rounded multiple of the period
-        counts = (time > self.start - 0.5 * step).astype(z.dtype)
-        weighted = tuple(counts * p for p in phi)
+        counts = (time > self.start - 0.5 * step) & (stay * (1.0 - self.forgetting) <= LONGEST_STAY)
+        weighted = tuple(counts.astype(z.dtype) * p for p in phi)
+        forgetting = jnp.where(counts, self.forgetting, 1.0)
 
-        # forgetting needs no start time: before it the sums are zero
         def add_terms(sums: tuple[RunningSum, ...], *terms: Number) -> tuple[RunningSum, ...]:
-            return tuple(total.add(self.forgetting, term) for total, term in zip(sums, terms, strict=True))
+            return tuple(total.add(forgetting, term) for total, term in zip(sums, terms, strict=True))
 
         information = add_terms(state.information, *(p * q for i, p in enumerate(weighted) for q in phi[i:]))
         moments = {side: add_terms(sums, *(p * torque[side] for p in weighted)) for side, sums in state.right.items()}
-        new = IdentifierState(filtered, information, moments, self.forgetting * state.weight, state.most)
-        return new._replace(most=jnp.maximum(state.most, _determinant(_sum_values(new, information))))
+        new = IdentifierState(near, stay, filtered, information, moments, forgetting * state.weight, state.most)
+        return new._replace(most=jnp.maximum(state.most, _information_on_first(_sum_values(new, information))))
 
     def settle(self, state: IdentifierState) -> IdentifierState:
         """Settle all sums, so that further samples lose no digits; :func:`jaxbl.chain.scan` does so block by block."""
@@ -146,7 +156,7 @@ class Identifier(eqx.Module):
     def solution(self, state: IdentifierState) -> dict[str, tuple[Number, tuple[Number, ...]]]:
         """Return for each side if the excitation determines the coefficients theta, and theta, which is always finite."""
         information = _sum_values(state, state.information)
-        remains = _determinant(information) > REMAINING ** len(state.regressors) * state.most
+        remains = _information_on_first(information) > REMAINING * state.most
         return {
             side: _solve_normal_equations(information, _sum_values(state, sums), remains)
             for side, sums in state.right.items()
@@ -161,8 +171,12 @@ def _sum_values(state: IdentifierState, sums: tuple[RunningSum, ...]) -> tuple[N
     return tuple(total.value(state.weight) for total in sums)
 
 
-def _determinant(information: tuple[Number, ...]) -> Number:
-    return information[0] if len(information) == 1 else information[0] * information[2] - information[1] ** 2
+def _information_on_first(information: tuple[Number, ...]) -> Number:
+    """Information on the first unknown, whatever the second: a twist that stays adds none, however large it is."""
+    if len(information) == 1:
+        return information[0]
+    first, product, second = information
+    return first - product * (product / jnp.where(second > 0.0, second, 1.0))
 
 
 def _regressor_correlation(information: tuple[Number, ...]) -> Number:

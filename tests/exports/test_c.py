@@ -172,17 +172,19 @@ def test_waves_over_whole_angles_are_not_for_float(tmp_path):
 
 @pytest.mark.program("gcc")
 @pytest.mark.parametrize("precision", ["double", "float"])
-def test_nothing_is_identified_after_a_standstill(tmp_path, precision):
+def test_a_standstill_leaves_the_last_numbers(tmp_path, precision):
     data = study() | {"identifier": {"forgetting": 0.99}}
     inputs = draw_samples(4000, 2)
-    inputs[2000:] = inputs[2000] * [0.0, 1.0, 1.0] + 1e-5 * np.random.default_rng(3).standard_normal((2000, 3))
+    # held under load: the torque that friction takes over is none of the law's
+    inputs[2000:] = inputs[2000] * [20.0, 1.0, 1.0] + 1e-5 * np.random.default_rng(3).standard_normal((2000, 3))
     native = export_native(tmp_path, data, precision)
     outputs = run_native(native, inputs)
     assert (to_integers(outputs[-1]) == to_integers(run_strict(data, precision, inputs)[-1])).all()
     columns = dict(zip((output["name"] for output in native.summary["outputs"]), outputs.T, strict=True))
     for side in ("motor", "load"):
-        assert columns[f"{side}_identified"][1999] and columns[f"{side}_stiffness"][1999]
-        assert not columns[f"{side}_identified"][-1] and not columns[f"{side}_stiffness"][-1]
+        assert columns[f"{side}_identified"][[1999, -1]].all()
+        before, *after = columns[f"{side}_stiffness"][[1999, 2500, -1]]
+        np.testing.assert_allclose(after, before, rtol=0.3)
 
 
 def draw_faults(inputs, random):
