@@ -10,7 +10,9 @@ from jaxbl.fused import Leaves
 from jaxbl.fused.jaxprs import ClosedJaxpr, trace
 
 from .lowering import (
+    Choice,
     Constant,
+    Operation,
     Routine,
     Value,
     Variable,
@@ -227,3 +229,87 @@ def lower_block(block: Block) -> Program:
 
 def _make_variables(quantities: Sequence[Port]) -> list[Variable]:
     return [Variable(quantity.dtype, -1, quantity.name) for quantity in quantities]
+
+
+_WHOLE = 1.5 * 2.0**52
+"""Doubles of this size have no fraction: once it is added and taken away again, a number is whole."""
+_FARTHEST = 2.0**31
+"""Steps of a reference beyond which a position is taken for a fault."""
+
+
+def widen_positions(program: Program) -> Program:
+    """Return a program in float whose positions come and go as double, counted from references that move along.
+
+    At any turn it computes with small numbers then, and finds what it finds near zero.
+    """
+    block, double = program.block, np.dtype(float)
+    if block.dtype != np.float32:
+        return program
+    names = {name for origin in block.references for name in (*origin.inputs, f"{origin.inputs[0]}_estimate")}
+    ports = {
+        kind: [port._replace(dtype=double) if port.name in names else port for port in getattr(block, kind)]
+        for kind in ("start_inputs", "inputs", "outputs")
+    }
+    origins = [Port(origin.name, "", "", double) for origin in block.references]
+    state, zero = (*program.state, *origins), Constant(np.zeros((), double))
+    start, _ = _count_from_references(program, program.start, [zero] * len(origins), ())
+    step, variables = _count_from_references(program, program.step, _make_variables(origins), program.state_variables)
+    return Program(block._replace(**ports), state, start, step, variables)
+
+
+def _count_from_references(
+    program: Program, routine: Routine, origins: Sequence[Any], states: Sequence[Variable]
+) -> tuple[Routine, tuple[Variable, ...]]:
+    """Return a routine that first moves the references from `origins`, and the variables of all states that it reads."""
+    references, double, flag = program.block.references, np.dtype(float), np.dtype(bool)
+    outer = {name: Variable(double, -1, name) for origin in references for name in origin.inputs}
+    new_states = list(states)
+
+    def add(statements: list[Any], name: str, *operands: Any, out: Variable | None = None, dtype: Any = double) -> Variable:
+        out = out or Variable(dtype, -1)
+        values = (
+            value if isinstance(value, Variable | Constant) else Constant(np.asarray(value, double)) for value in operands
+        )
+        statements.append(Operation(out, name, tuple(values), ""))
+        return out
+
+    before: list[Any] = []
+    moves: list[Any] = []
+    after: list[Any] = []
+    away = add(before, "sub", outer[references[0].inputs[0]], origins[0])
+    away = add(before, "div", away, references[0].step)
+    size = add(before, "abs", away)
+    far, possible = add(before, "ge", size, 1.0, dtype=flag), add(before, "lt", size, _FARTHEST, dtype=flag)
+    far = add(before, "and", far, possible, dtype=flag)
+    steps = add(moves, "sub", add(moves, "add", away, _WHOLE), _WHOLE)
+    outs: dict[Variable, tuple[Any, Any]] = {}
+    places: dict[str, Variable] = {}
+    for reference, origin in zip(references, origins, strict=True):
+        way, place = add(moves, "mul", steps, reference.step), Variable(double, -1)
+        outs[place] = add(moves, "add", origin, way), origin
+        places |= dict.fromkeys(reference.inputs, place)
+        for i, variable in enumerate(states):
+            if program.state[i].name in reference.states:
+                new_states[i] = _free_name(variable)
+                near = add(moves, "sub", add(moves, "convert", new_states[i]), way)
+                outs[variable] = add(moves, "convert", near, dtype=variable.dtype), new_states[i]
+    yes, no = zip(*outs.values(), strict=True)
+    before.append(Choice(far, tuple(outs), (Routine(tuple(moves), yes), Routine((), no)), ""))
+    for variable in drop_unread(routine)[1]:
+        if variable.name in places:
+            name = _free_name(variable).name
+            add(before, "convert", add(before, "sub", outer[name], places[name]), out=variable)
+    count = len(program.state)
+    outputs = list(routine.results[count:])
+    for i, port in enumerate(program.block.outputs[: len(outputs)]):
+        if (position := port.name.removesuffix("_estimate")) in places and port.name != position:
+            outputs[i] = add(after, "add", places[position], add(after, "convert", outputs[i]))
+    results = *routine.results[:count], *(places[reference.inputs[0]] for reference in references), *outputs
+    full = Routine((*before, *routine.statements, *after), results)
+    return drop_unread(full)[0], (*new_states, *(origin for origin in origins if isinstance(origin, Variable)))
+
+
+def _free_name(variable: Variable) -> Variable:
+    """Return a variable that has the name of another one, which becomes a numbered one."""
+    named, variable.name = Variable(variable.dtype, -1, variable.name), ""
+    return named

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .block import Port, Program, Reference, describe_number
-from .lowering import Constant, Operation, Routine, Value, Variable, drop_unread, find_constants
+from .block import Port, Program, describe_number
+from .lowering import Constant, Operation, Value, Variable, find_constants
 from .writer import Writer, find_unread_names, write_comment, write_shortest
 
 _TYPES = {
@@ -52,23 +52,6 @@ def write_c_code(program: Program, head_lines: Sequence[str]) -> Code:
     parts = [head, "", *includes, *constants, "" if constants else None, *writer.write_helpers(), *writer.lines]
     source = "\n".join(part for part in parts if part is not None)
     return Code(f"{source.rstrip()}\n", _write_header(program, head))
-
-
-def widen_positions(program: Program) -> Program:
-    """Return a program in float whose positions come and go as double, counted from references that move along.
-
-    At any turn it computes with small numbers then, and finds what it finds near zero.
-    """
-    block, double = program.block, np.dtype(float)
-    if block.dtype != np.float32:
-        return program
-    names = {name for origin in block.references for name in (*origin.inputs, f"{origin.inputs[0]}_estimate")}
-    ports = {
-        kind: [port._replace(dtype=double) if port.name in names else port for port in getattr(block, kind)]
-        for kind in ("start_inputs", "inputs", "outputs")
-    }
-    origins = [Port(origin.name, "", "", double) for origin in block.references]
-    return program._replace(block=block._replace(**ports), state=(*program.state, *origins))
 
 
 def describe_constant(program: Program, constant: Constant) -> str:
@@ -159,54 +142,26 @@ class _C(Writer):
         """One of the two; `state_variables` are variables for the state that it finds."""
         program, block = self.program, self.program.block
         routine = (program.start, program.step)[routine_index]
-        states = program.state[: len(program.state_variables)]
-        references = block.references if len(states) < len(program.state) else ()
         self.add_lines(head, "{")
         self._depth += 1
         # constants that only this routine reads
         definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
         self.add_lines(*definitions, *([""] if definitions else []))
         self.add_lines(*(f"(void){name};" for name in find_unread_names(routine, arguments)))
-        if references:
-            self._move_references(routine, references, [state.name for state in states if routine_index])
-        for quantity, variable in zip(states, state_variables, strict=routine_index == 1):
+        for quantity, variable in zip(program.state, state_variables, strict=routine_index == 1):
             self.give_name(variable, f"old_{quantity.name}")
             self.define(variable, f"state->{quantity.name}")
         self.add_lines("")
         self._source = ""
         self.write_statements(routine.statements)
         self.add_lines("")
-        places = [f"state->{quantity.name}" for quantity in states]
+        places = [f"state->{quantity.name}" for quantity in program.state]
         outputs = [f"outputs->{quantity.name}" for quantity in block.outputs]
         output_count = len(routine.results) - len(places)
-        origins = {f"outputs->{origin.inputs[0]}_estimate": f"state->{origin.name} + (double)" for origin in references}
         for place, value in zip((*places, *outputs[:output_count]), routine.results, strict=True):
-            self.add_lines(f"{place} = {origins.get(place, '')}{self.text(value)};")
+            self.assign(place, self.text(value))
         self._depth -= 1
         self.add_lines("}")
-
-    def _move_references(self, routine: Routine, references: Sequence[Reference], states: Collection[str]) -> None:
-        """Write how references follow the first position, with the `states` that are positions, and what is left."""
-        first, away, steps = references[0], self.make_unique("away"), self.make_unique("steps")
-        self.needs_math = True
-        if not states:
-            self.add_lines(*(f"state->{origin.name} = 0.0;" for origin in references))
-        self.add_lines(
-            f"const double {away} = ({first.inputs[0]} - state->{first.name}) / {first.step!r};",
-            f"if ((fabs({away}) >= 1.0) && (fabs({away}) < 2147483648.0))",
-            "{",
-            f"    const double {steps} = (double)(int32_t){away};",
-        )
-        for origin in references:
-            self.add_lines(f"    state->{origin.name} += {steps} * {origin.step!r};")
-            for place in (f"state->{state}" for state in states if state in origin.states):
-                self.add_lines(f"    {place} = (float)((double){place} - ({steps} * {origin.step!r}));")
-        self.add_lines("}")
-        names = {name: origin.name for origin in references for name in origin.inputs}
-        for variable in drop_unread(routine)[1]:
-            if variable.name in names:
-                self.give_name(variable, f"near_{variable.name}")
-                self.define(variable, f"(float)({variable.name} - state->{names[variable.name]})")
 
     def define_constants(self, constants: Collection[Constant]) -> list[str]:
         """Write definitions of constants, in the order of the code."""

@@ -15,8 +15,8 @@ from jaxbl.fused import Unsupported
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.store import identity
 
-from .block import Port, Program, lower_block
-from .c import widen_positions, write_c_code
+from .block import Port, Program, lower_block, widen_positions
+from .c import write_c_code
 from .chain import build_observer_chain
 from .filter import input_columns, write_filter_code
 from .fmu import FMI, build_fmu
@@ -93,7 +93,7 @@ class Export(NamedTuple):
 
 
 def _export_c(request: Request) -> Files:
-    program, name = widen_positions(_lower_observers(request)), request.name
+    program, name = _lower_observers(request), request.name
     code = write_c_code(program, _write_head_of_code(request, program, _write_c_call(program)))
     texts = {f"{name}.c": code.source, f"{name}.h": code.header, f"{name}_filter.c": write_filter_code(program)}
     summary = _summarise(request, program) | {"state_bytes": count_state_bytes(program)}
@@ -262,7 +262,8 @@ def _make_code_name(file: str, unnamed: str) -> str:
 
 
 def _lower_observers(request: Request) -> Program:
-    return lower_block(build_observer_chain(request.config, request.name, np.dtype(PRECISIONS[request.precision])))
+    block = build_observer_chain(request.config, request.name, np.dtype(PRECISIONS[request.precision]))
+    return widen_positions(lower_block(block))
 
 
 def _describe_cost(request: Request, program: Program) -> str:
