@@ -154,3 +154,24 @@ SERVO: dict[str, Any] = {
     "theta_e": {"column": 1, "minus": 2, "unit": "deg", "factor": 220.0 / 4096.0},
     "absent": ["u"],
 }
+
+
+def simulate_band(
+    random: np.random.Generator, count: int = 3000, period: float = 0.01
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    """Displacement (m) and force (N) of play, spring and slip in series; and the truth."""
+    time, reach = period * np.arange(count), 10.0 ** random.uniform(-3.0, -1.5)
+    play, windup, stiffness = (
+        reach * random.uniform(0.03, 0.3),
+        reach * random.uniform(0.05, 0.3),
+        10.0 ** random.uniform(4, 7),
+    )
+    x = reach * (0.7 * np.sin(2.0 * np.pi * 0.2 * time) + 0.3 * np.sin(2.0 * np.pi * 0.47 * time + random.uniform(0.0, 6.0)))
+    band, force = x[0] + (play + windup) * random.uniform(-1.0, 1.0), np.empty(count)
+    for i, position in enumerate(x):
+        band = np.clip(band, position - play - windup, position + play + windup)
+        twist = position - band
+        force[i] = stiffness * (twist - np.clip(twist, -play, play))
+    slip = stiffness * windup
+    force += 10.0 ** random.uniform(-2.5, -1.3) * slip * random.standard_normal(count)
+    return x, force, {"stiffness": stiffness, "half_gap": play, "slip": slip}

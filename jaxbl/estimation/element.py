@@ -31,6 +31,7 @@ _PATHS = {
     "friction_coefficient": f"effects.transmission.{LoadFriction.kind}.coefficient",
 }
 """Paths in a study."""
+_SLIP_NOTE = "play, spring and slip lie in series here: studies have no slip, so that their table has play and spring alone"
 
 
 @dataclass(frozen=True)
@@ -128,8 +129,10 @@ def run_element(task: ElementTask) -> ElementIdentification:
         )
     stiffness = element.numbers["stiffness"]
     if "stiffness" in element.open or stiffness.value <= 0.0:
+        others = element.numbers.keys() - {"stiffness", "offset", "centre", *element.open}
+        found = "".join(f"; what it shows: {name} {element.numbers[name]}" for name in sorted(others))
         raise InputError(
-            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}); "
+            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){found}; "
             "see columns and signs in [log]"
         )
     moved = element_displacement(record, task.gear_ratio)
@@ -155,7 +158,7 @@ def _summary(task: ElementTask, element: Element) -> JsonObject:
         "method": {"element": {"terms": element.terms, "gains": element.gains, "reversals": element.reversals}},
         "torque": {"element": {"rms": element.residual, "relative": element.share, "unit": element.numbers["offset"].unit}},
         "warnings": record.warnings,
-        "notes": record.notes,
+        "notes": [*record.notes, *([_SLIP_NOTE] if "slip" in numbers else [])],
     }
     if task.holdout is not None:
         error = element_error(element, make_rig_log(task.holdout, task.gear_ratio))

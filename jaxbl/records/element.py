@@ -4,7 +4,8 @@
 
 with the displacement x of one side against the other, the half gap b, the direction of motion s = +-1, which stays the same
 at rest, and Bouc and Wen's hysteresis dh/dd = 1 / length while h returns to 0, (1 - h²) / length while it grows (as in the
-package's effect). There are no masses and no nominal numbers in it.
+package's effect). There are no masses and no nominal numbers in it. Where play, spring and slip in series say more (a band
+on a pulley), x_0 is dragged along as soon as the spring is wound up by `windup`: the torque is at most K windup.
 
 All numbers except x_0, b and the length are linear: they follow by least squares from a choice of these three (variable
 projection: G. Golub, V. Pereyra, SIAM J. Numer. Anal. 10, 1973). A term stays in the model if it lowers the squared error on
@@ -49,11 +50,14 @@ _HALF_GAP_STARTS = 0.02, 0.1, 0.3, 0.5, 0.7
 _CENTRE_STARTS = -0.5, -0.2, 0.0, 0.2, 0.5
 """Centres of the gap at which searches start, from the middle of the range, over half of it."""
 _LENGTH_STARTS = 0.02, 0.06, 0.2, 0.6
-"""Lengths of the hysteresis at which searches start, over half the range."""
+"""Lengths of the hysteresis, and windups of a slipping transmission, at which searches start, over half the range."""
+_SERIES = "gap", "slip"
+"""Terms of play, spring and slip in series."""
 
 TERMS = ("gap", "damping", "dry friction", "hysteresis", "friction under load")
 """Terms of a transmission beside its stiffness."""
-_SHAPES_BY_TERM = {"gap": ("centre", "half_gap"), "hysteresis": ("length",), "friction under load": ("centre",)}
+_SHAPES_BY_TERM = {"gap": ("centre", "half_gap"), "hysteresis": ("length",), "friction under load": ("centre",),
+                   "slip": ("windup",)}  # fmt: skip
 """Term -> its nonlinear numbers."""
 SIZE_NAMES = {
     "damping": "damping",
@@ -71,7 +75,8 @@ class Element:
     Attributes:
         numbers: `stiffness`, `offset` (torque at displacement 0, or at the centre) and the numbers of the terms: `half_gap`,
             `centre` (displacement at the middle of the gap, or without torque), `damping`, `dry_friction`, `hysteresis`
-            (its largest torque), `length`, `friction_coefficient` (friction under load, over the torque).
+            (its largest torque), `length`, `friction_coefficient` (friction under load, over the torque), `slip` (largest
+            torque of a transmission that slips beyond it).
         open: names of the numbers that the log leaves uncertain by more than half.
         gains: term of the model -> squared error without it over that with it, less 1, on blocks that were left out.
         terms: of the model.
@@ -168,6 +173,8 @@ class _Rig:
         shapes_by_name = dict(zip(_shape_names(terms), shapes, strict=True))
         x = self.position - shapes_by_name.get("centre", 0.0)
         b = shapes_by_name.get("half_gap", 0.0)
+        if "slip" in terms:
+            x = x - self._drag(b + shapes_by_name["windup"])
         deflection = x - np.clip(x, -b, b)
         # no damping inside the gap; a part of it in a sample that crosses an end of the gap
         contact = np.clip((np.abs(x) - b) / self.blur + 0.5, 0.0, 1.0) if "gap" in terms else 1.0
@@ -180,6 +187,18 @@ class _Rig:
             signals["hysteresis"] = self._compute_hysteresis(deflection, shapes_by_name["length"])
         columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
         return np.stack([column[self.rows] for column in columns], axis=1)
+
+    def _drag(self, reach: float) -> np.ndarray:
+        """Return where the position has dragged what follows it at a distance of at most `reach`, shape (samples,)."""
+        dragged, last = np.zeros(len(self.position)), 0.0
+        for part, begins in zip(self.stretches, self.begins, strict=True):
+            forward = float(self.direction[part.start])
+            # how it was wound up before is unknown: not at all errs least
+            last = self.position[part.start] if begins else last
+            ahead = np.maximum.accumulate(forward * self.position[part]) - reach
+            dragged[part] = forward * np.maximum(ahead, forward * last)
+            last = float(dragged[part.stop - 1])
+        return dragged
 
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
@@ -210,6 +229,9 @@ def fit_element(log: RigLog, *, linear: bool) -> Element | None:
     models.sort(key=lambda model: len(model.sizes) + len(model.shapes))
     best = models[1] if _compute_gain(rig, *models) is not None else models[0]
     best = _drop_terms(rig, best)
+    series = _drop_terms(rig, _fit_model(rig, _SERIES))
+    if "slip" in series.terms and series.is_possible and _compute_gain(rig, best, series) is not None:
+        best = series
     gains = {term: _compute_gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
     full_rig = _prepare_rig(log)
     return _make_element(rig, full_rig or rig, best, gains, linear)
@@ -352,7 +374,9 @@ def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model
 
 
 def _shape_names(terms: Sequence[str]) -> list[str]:
-    return list(dict.fromkeys(name for term in terms for name in _SHAPES_BY_TERM.get(term, ())))
+    names = dict.fromkeys(name for term in terms for name in _SHAPES_BY_TERM.get(term, ()))
+    # a transmission that slips has no centre
+    return [name for name in names if name != "centre" or "slip" not in terms]
 
 
 def _fit_sizes(columns: np.ndarray, torque: np.ndarray) -> np.ndarray:
@@ -371,6 +395,7 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
         "centre": ([middle + half * start for start in _CENTRE_STARTS], middle - half, middle + half),
         "half_gap": ([half * start for start in _HALF_GAP_STARTS], 0.0, half),
         "length": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, 10.0 * half),
+        "windup": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, half),
     }
 
     def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
@@ -427,6 +452,13 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         slopes.append((high - low) / (2.0 * step))
     jacobian = np.column_stack([rig.compute_columns(model.terms, model.shapes), *slopes])
     residual = rig.fitted_torque - rig.compute_torque(model)
+    if "windup" in names:
+        # the torque at which it slips, in place of the windup there
+        place, stiffness = names.index("windup"), values[0]
+        names[place] = "slip"
+        jacobian[:, 0] -= jacobian[:, place] * values[place] / stiffness
+        jacobian[:, place] /= stiffness
+        values[place] *= stiffness
     _, errors = fit_with_jackknife(residual + jacobian @ values, jacobian)
     quantile = float(stdtrit(BLOCKS - 1, 0.975))
     numbers, open_ = {}, []
@@ -452,7 +484,7 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
 
 _UNITS = {
     "stiffness": "N m/rad", "offset": "N m", "damping": "N m s/rad", "dry_friction": "N m", "hysteresis": "N m",
-    "centre": "rad", "half_gap": "rad", "length": "rad", "friction_coefficient": "",
+    "slip": "N m", "centre": "rad", "half_gap": "rad", "length": "rad", "friction_coefficient": "",
 }  # fmt: skip
 """Units of numbers on a rotary axis."""
 

@@ -169,7 +169,7 @@ def make_rig_log(record: Record, gear_ratio: float | None) -> RigLog:
     return RigLog(displacement, record.torque, record.segments, record.sample_period, noise)
 
 
-_ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap"} | SIZE_NAMES
+_ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap", "slip": "slip"} | SIZE_NAMES
 """Quantity of an element -> name of its number."""
 
 

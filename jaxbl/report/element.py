@@ -59,7 +59,7 @@ def draw_element(result: ElementIdentification) -> list[Figure]:
     unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))
     time, x, u, fitted = (trace[name].to_numpy() for name in ("t", "displacement", "u", "torque"))
     parts: list[Part] = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)]
-    if "half_gap" in numbers:
+    if {"half_gap", "centre"} <= numbers.keys():
         middle, half = numbers["centre"].value, numbers["half_gap"].value
         parts.append(Span(middle - half, middle + half, "gap", ORANGE))
     loop = Panel(Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})"), parts)

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from measured import simulate_band
 
 import jaxbl
 from jaxbl.config import read_config
@@ -46,3 +47,22 @@ def test_an_element_needs_its_displacement_in_every_log(tmp_path):
     for log, holdout in ((both_sides, motor), (motor, both_sides)):
         with pytest.raises(jaxbl.InputError, match=r"motor\.parquet: has no load position, which .*both\.parquet has"):
             jaxbl.identify_element(log, {}, holdout=holdout)
+
+
+def test_a_band_is_reported_with_its_slip_or_what_was_found(tmp_path):
+    """Play, spring and slip in series have no stiffness beside them: such rigs were refused."""
+    random = np.random.default_rng(3)
+    x, force, truth = simulate_band(random)
+    pd.DataFrame({"t": 0.01 * np.arange(len(x)), "theta_e": x, "u": force}).to_csv(tmp_path / "band.csv", index=False)
+    table = {"kind": "element", "theta_e": {"column": "theta_e", "unit": "m"}}
+    band = jaxbl.identify_element(tmp_path / "band.csv", table)
+    assert band.summary["parameters"]["slip"]["value"] == pytest.approx(truth["slip"], rel=0.02)
+    assert any("no slip" in note for note in band.summary["notes"])
+    assert band.tables["transmission"].keys() == {"law", "stiffness", "half_gap"}
+    jaxbl.write_report(band, tmp_path / "out")
+    assert "slip" in (tmp_path / "out" / "report.html").read_text()
+    # friction alone: the stiffness stays open, and the friction is named
+    force = 20.0 * np.sign(np.gradient(x)) + 0.1 * random.standard_normal(len(x))
+    pd.DataFrame({"t": 0.01 * np.arange(len(x)), "theta_e": x, "u": force}).to_csv(tmp_path / "brake.csv", index=False)
+    with pytest.raises(jaxbl.InputError, match=r"does not follow the displacement .*; what it shows: dry_friction 20"):
+        jaxbl.identify_element(tmp_path / "brake.csv", table)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from measured import simulate_band
 
 from jaxbl.records import element
 from jaxbl.records.element import RigLog, fit_element
@@ -41,6 +42,19 @@ def test_a_gap_hysteresis_and_friction_are_told_apart():
     assert fit.residual == pytest.approx(0.1, rel=0.1)
     assert fit.numbers["stiffness"].unit == "N m/rad"
     assert np.isnan(fit.torque[:20]).all() and np.nanstd(fit.torque - u) < 0.11
+
+
+def test_play_spring_and_slip_in_series(repeats):
+    random = np.random.default_rng(46)
+    for _ in range(repeats(3, 30)):
+        x, force, truth = simulate_band(random)
+        fit = fit_element(RigLog(x, force, [slice(0, len(x))], PERIOD, 0.0), linear=True)
+        assert set(fit.terms) == {"gap", "slip"} and not fit.open
+        for name, value in truth.items():
+            number = fit.numbers[name]
+            assert abs(number.value / value - 1.0) < 0.05, (name, number, value)
+            assert abs(number.value - value) < 5.0 * number.standard_error + 2e-3 * value, (name, number, value)
+        assert fit.numbers["slip"].unit == "N" and "centre" not in fit.numbers
 
 
 def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
