@@ -147,7 +147,7 @@ def _short(way: JsonObject) -> str:
 
 def _size(change: float) -> str:
     """A relative change in few characters."""
-    return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{100.0 * change:+.2g} %"
+    return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{'+' * (change > 0.0)}{percent(change)}"
 
 
 def _way(symbol: str, unit: str, way: JsonObject) -> str:

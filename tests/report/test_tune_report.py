@@ -17,7 +17,7 @@ from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
 from jaxbl.report.panels import Map, Span
 from jaxbl.report.results import describe, write_report
-from jaxbl.report.tune import draw_tuning
+from jaxbl.report.tune import _size, draw_tuning
 from jaxbl.sweeps.trial import run
 
 SLOW_GAINS = {"lambda": 1e-3, "alpha": 0.05}
@@ -121,6 +121,14 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuning):
         forbidden = "motor: a smaller error is forbidden by margin_exact."
         assert (forbidden in describe(result).remarks) == bool(binding)
         assert ("smaller λ: margin_exact\n" in limits.panels[0].title) == bool(binding)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [(0.996, "+100 %"), (-0.9999, "-100 %"), (-0.5, "-50 %"), (0.0123, "+1.2 %"), (0.0, "0 %"), (1.0, "× 2")],
+)
+def test_a_change_has_no_exponent(change, text):
+    assert _size(change) == text
 
 
 def test_limits_are_drawn_as_the_numbers_have_them(tuning):
