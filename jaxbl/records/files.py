@@ -28,7 +28,18 @@ from jaxbl.registry import Registry
 from jaxbl.validation import LARGEST, check_file, explain_missing_file, suggest_word
 from jaxbl.workers import check_cost
 
-from .libraries import Column, ColumnName, Columns, Selection, read_at, read_bag, read_mcap, read_mdf, read_tdms
+from .libraries import (
+    Column,
+    ColumnName,
+    Columns,
+    Selection,
+    name_members,
+    read_at,
+    read_bag,
+    read_mcap,
+    read_mdf,
+    read_tdms,
+)
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
 _LIBRARY_READERS: tuple[tuple[bytes, str, Callable[..., Columns]], ...] = (
@@ -654,7 +665,7 @@ def _read_json(text: str) -> Columns:
     """Read an array of objects or of rows of numbers, an object that holds one, objects line by line, or arrays by name."""
     # NumPy has no whole numbers of more digits than stamps in ns, and Python reads none of thousands
     load = partial(
-        json.loads, parse_int=lambda digits: (int if len(digits) < 20 else float)(digits), object_pairs_hook=_name_members
+        json.loads, parse_int=lambda digits: (int if len(digits) < 20 else float)(digits), object_pairs_hook=name_members
     )
     try:
         content = load(text)
@@ -678,15 +689,6 @@ def _read_json(text: str) -> Columns:
     else:
         raise InputError("should hold an array of objects, one a row, or of rows of equally many numbers")
     return _require_columns(columns)
-
-
-def _name_members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members = dict(pairs)
-    if len(members) < len(pairs):
-        names = [name for name, _ in pairs]
-        duplicate = next(name for i, name in enumerate(names) if name in names[:i])
-        raise InputError(f"two members of an object are called '{duplicate}'; names should differ")
-    return members
 
 
 def _is_matrix(value: Any) -> bool:

@@ -132,6 +132,16 @@ _Messages = Iterator[tuple[str, int, Any]]
 """Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
 
 
+def name_members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of JSON of its members. Raises InputError where two have one name."""
+    members = dict[str, Any]()
+    for name, value in pairs:
+        if name in members:
+            raise InputError(f"two members of an object are called '{name}'; names should differ")
+        members[name] = value
+    return members
+
+
 def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     """Read an MCAP file with messages in JSON or of ROS 2; columns are those of :func:`read_bag`."""
     library = _import_library("mcap.reader", "MCAP", "mcap")
@@ -152,7 +162,7 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
         with path.open("rb") as file:
             for schema, channel, message in library.make_reader(file, validate_crcs=True).iter_messages(topics=list(topics)):
                 if channel.message_encoding == "json":
-                    yield channel.topic, message.log_time, json.loads(message.data)
+                    yield channel.topic, message.log_time, json.loads(message.data, object_pairs_hook=name_members)
                 else:
                     if schema.id not in types:
                         types[schema.id] = _message_types(schema)

@@ -388,6 +388,15 @@ def write_bag(path):
             writer.write(topic, time + 5_000_000, store.serialize_cdr(message, state.__msgtype__))
 
 
+@pytest.mark.parametrize("member", ['"u": 2', '"x": {"y": 1, "z": 2, "y": 3}', '"x": [{"y": 1, "y": 1}]'])
+def test_two_members_of_one_name_in_a_message_are_refused(tmp_path, monkeypatch, member):
+    """The last one would be taken without a word."""
+    monkeypatch.setattr("mcap_log.json.dumps", lambda message: f'{{"u": 1, {member}}}')
+    write_mcap(tmp_path / "log.mcap", {"s": [(t, {}) for t in T.tolist()]})
+    with pytest.raises(InputError, match=r"log\.mcap: two members of an object are called '[uy]'; names should differ"):
+        read_log_file(tmp_path / "log.mcap")
+
+
 def test_mcap_and_ros_bags_by_their_libraries(tmp_path):
     write_mcap_log(tmp_path / "log.mcap")
     file = read_log_file(tmp_path / "log.mcap", {"t", "/axis.u", "/slow.v"})
