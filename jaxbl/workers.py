@@ -5,6 +5,7 @@ import itertools
 import multiprocessing
 import os
 import signal
+import stat
 import sys
 import threading
 import warnings
@@ -240,31 +241,44 @@ def _find_cache_folder() -> Path | None:
         folder = (caches if caches.is_absolute() else Path.home() / ".cache") / "jaxbl"
     except RuntimeError:
         return None  # a user without a home
-    programs = folder / sys.implementation.cache_tag
-    return programs if make_private_folder(folder) and make_private_folder(programs) else None
+    private = make_private_folder(folder)
+    return private and make_private_folder(private / sys.implementation.cache_tag)
 
 
-def make_private_folder(folder: Path) -> bool:
+def make_private_folder(folder: Path) -> Path | None:
     """Make a folder for compiled code, readable by this user alone if it is new.
 
-    Returns True if it exists, belongs to this user, and nobody else may write into it. Otherwise one line is printed.
+    Returns its place without links if it belongs to this user, nobody else may write into it, and nobody else can put
+    another folder in its place. Otherwise one line is printed.
     """
     try:
+        folder = folder.resolve()
         folder.parent.mkdir(parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.stat()
-    except OSError:
-        return False
-    fault = ""
-    # on Windows a user's own folders are closed to others
-    if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
-        fault = "is another user's"
-    elif hasattr(os, "geteuid") and status.st_mode & 0o022:
-        fault = "can be written to by others; remove it, to have it made anew"
+        fault = _find_fault(folder)
+    except (OSError, RuntimeError):  # a circle of links
+        return None
     if fault and folder not in _refused_folders:
         _refused_folders.add(folder)
-        print(f"jaxbl: {escape_unprintable(str(folder))}: {fault}; compiled programs are not stored there", file=sys.stderr)
-    return not fault
+        print(f"jaxbl: {escape_unprintable(fault)}; compiled programs are not stored there", file=sys.stderr)
+    return None if fault else folder
+
+
+def _find_fault(folder: Path) -> str:
+    """Say through which folder others could change what is stored in this one; "" if they cannot."""
+    if not hasattr(os, "geteuid"):  # on Windows a user's own folders are closed to others
+        return ""
+    user, group, system = os.geteuid(), os.getegid(), Path(folder.anchor).stat().st_uid
+    for place in (folder, *folder.parents):
+        status, above = place.stat(), place != folder
+        if status.st_uid != user and not (above and status.st_uid == system):
+            return f"{place}: is another user's"
+        # a sticky folder lets nobody move what is another's; where users have groups of their own, these may write
+        others = 0o002 if above and status.st_gid == group else 0o022
+        if status.st_mode & others and not (above and status.st_mode & stat.S_ISVTX):
+            remedy = "chmod go-w closes it" if above else "remove it, to have it made anew"
+            return f"{place}: can be written to by others; {remedy}"
+    return ""
 
 
 _refused_folders: set[Path] = set()

@@ -149,6 +149,26 @@ def test_compiled_programs_are_kept_in_a_folder_of_the_user_alone(home, monkeypa
     assert [path.name for path in home.iterdir()] == [".cache"]
 
 
+@pytest.mark.parametrize("depth", range(3))
+@pytest.mark.parametrize("mode", [0o777, 0o757, 0o702, 0o1777, 0o755, 0o711])
+def test_compiled_programs_are_not_kept_where_others_can_put_another_folder(home, monkeypatch, capsys, mode, depth):
+    """A folder is checked once, and read from later; in a sticky one nobody can move it."""
+    caches = home / "a" / "b" / "c"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "link"))
+    caches.mkdir(parents=True)
+    (home / "link").symlink_to(caches)
+    place = (caches, *caches.parents)[depth]
+    place.chmod(mode)
+    if mode & 0o002 and not mode & 0o1000:
+        assert _find_cache_folder() is None
+        line = f"jaxbl: {place}: can be written to by others; chmod go-w closes it; compiled programs are not stored there"
+        assert capsys.readouterr().err == f"{line}\n"
+        place.chmod(0o755)
+    folder = _find_cache_folder()
+    # a link that is turned elsewhere afterwards moves nothing
+    assert folder == caches / "jaxbl" / sys.implementation.cache_tag and not capsys.readouterr().err
+
+
 def test_compiled_programs_of_others_are_not_run(home, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "caches"))
     folder = home / "caches" / "jaxbl"

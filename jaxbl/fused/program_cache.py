@@ -53,9 +53,10 @@ def cache_folder() -> Path | None:
 @functools.cache
 def _make_folder(name: str) -> Path | None:
     """The folder of this version; None if others could write to it. Old versions are deleted."""
-    folder = Path(name) / _version_hash()
     # what is in them is run
-    if not (make_private_folder(folder.parent) and make_private_folder(folder)):
+    programs = make_private_folder(Path(name))
+    folder = programs and make_private_folder(programs / _version_hash())
+    if folder is None:
         return None
     try:
         os.utime(folder)
