@@ -43,7 +43,7 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
     steps = [_propose("How do other metrics look, over other axes? Maps in the browser.", "explore", folder)]
     if is_remote(file):
         return steps
-    gains = {f"observer.{side}.{gain}" for side in ("motor", "load") for gain in ("lambda", "alpha")}
+    gains = {f"observer.{side}.{gain}" for side in study.sides for gain in ("lambda", "alpha")}
     # where no gains work, none can be chosen
     if gains & {*study.axis_paths} and card.verdict == "good":
         question = "Which gains have the least error, and are they better than the usual rule?"

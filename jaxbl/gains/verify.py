@@ -165,7 +165,7 @@ def sides_with_gain_axes(config: Config) -> list[str]:
         InputError: there is none, or the axes are no grid that `verify` can search.
     """
     paths = {axis.path for axis in config.axes}
-    sides = [side for side in ("motor", "load") if {f"observer.{side}.alpha", f"observer.{side}.lambda"} <= paths]
+    sides = [side for side in config.sides if {f"observer.{side}.alpha", f"observer.{side}.lambda"} <= paths]
     if not sides:
         raise InputError(
             "axes: verify needs axes over both gains of an observer, such as observer.motor.alpha and observer.motor.lambda"

@@ -29,7 +29,6 @@ from .gain_plane import condition_curves
 from .panels import (
     COLOURS,
     MISSING,
-    SIDES,
     Array,
     Axis,
     Band,
@@ -105,7 +104,7 @@ def draw(result: StudyResult) -> list[Figure]:
 def _rows(result: StudyResult, figure: FigureTable, points: Points | None, dots: Series | None) -> Rows:
     """The rows that a figure shows, with the columns that it needs."""
     config = result.config
-    metrics = {f"{side}.{name}" for side in SIDES for name in ("converged", "f_plus", "margin_alpha")}
+    metrics = {f"{side}.{name}" for side in config.sides for name in ("converged", "f_plus", "margin_alpha")}
     metrics |= {figure.value, "finite"}
     columns = [*config.axis_paths, *(name for name in result.columns if name in metrics)]
 

@@ -6,6 +6,7 @@
 import base64
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ SIDES = ("motor", "load")
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK = COLOURS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000",
 )  # fmt: skip
-SIDE_COLOURS = {"motor": BLUE, "load": VERMILION}
+SIDE_COLOURS = defaultdict(lambda: GREEN, {"motor": BLUE, "load": VERMILION})
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 MAP = "viridis"
 MISSING = "#BDBDBD"

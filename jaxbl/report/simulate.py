@@ -38,13 +38,13 @@ def write_trial(trial: Trial, folder: Path) -> str:
 def describe_trial(trial: Trial) -> Result:
     """Say whether the observers converged, and how large their errors are."""
     summary, metrics, limits = trial.summary, trial.summary["metrics"], trial.config.run
-    sides = [side for side in SIDES if f"{side}.converged" in metrics]
+    sides, drive = trial.config.sides, trial.config.drive.build()
     failed = [side for side in sides if not metrics[f"{side}.converged"]]
     verdict, headline = "failed", "The run diverges: a number overflows."
     if metrics["finite"] and failed:
         who = (
             f"The {failed[0]} observer does not converge"
-            if sides != failed or len(sides) == 1
+            if len(sides) != len(failed) or len(sides) == 1
             else "Neither observer converges"
         )
         headline = f"{who}: an error exceeds its tolerance in the last quarter of the run."
@@ -57,10 +57,10 @@ def describe_trial(trial: Trial) -> Result:
             if judged["f_plus"]
         )
         headline += f" What the gains allow f⁺ to grow: {reserves}." if reserves else ""
-    ratios = {"motor": 1.0, "load": getattr(trial.config.drive, "gear_ratio", 1.0)}
     units = {"velocity": "rad/s", "torque": "N m"}
     errors = {(side, quantity): metrics[f"{side}.{quantity}_rmse"] for side in sides for quantity in units}
-    bounds = {(side, "velocity"): f"; the largest may be {limits.velocity_tolerance / ratios[side]:.3g}" for side in sides}
+    largest = {side: limits.velocity_tolerance / drive.ratio(side) for side in sides}
+    bounds = {(side, "velocity"): f"; the largest may be {largest[side]:.3g}" for side in sides}
     if trial.config.controller is not None:
         side, units["following"] = trial.config.controller.side, "rad"
         errors[side, "following"] = metrics[f"{side}.following_rmse"]
@@ -89,14 +89,15 @@ def describe_trial(trial: Trial) -> Result:
 def draw_trial(trial: Trial) -> list[Figure]:
     """All figures of a run."""
     trace, controller = trial.trace, trial.config.controller
-    sides = [side for side in SIDES if f"{side}.position" in trace]
-    name = "transmitted torque C" if len(sides) == 2 else "disturbance torque"
-    estimates = {f"from the {side} observer": (trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]) for side in sides}
+    is_geared = trial.config.is_geared
+    name, seen_from = ("transmitted torque C", SIDES) if is_geared else ("disturbance torque", ("motor",))
+    estimates = {f"from the {side} observer": (trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]) for side in seen_from}
     caption = f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16)."
     figures = [_compare("torque", trace, name, "N m", ("true", trace["torque"]), estimates, caption)]
-    for side in sides:
+    for side in trial.config.sides:
         true, estimate = (trace[f"{side}.velocity{end}"] for end in ("", "_estimate"))
-        caption = f"{side.capitalize()} velocity, true and observed, and the error (analogue of Figs. {_FIGURES[side]})."
+        paper = f" (analogue of Figs. {_FIGURES[side]})" if side in _FIGURES else ""
+        caption = f"{side.capitalize()} velocity, true and observed, and the error{paper}."
         observed = {"observer": (estimate, VERMILION)}
         figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", ("true", true), observed, caption))
     if controller is not None:
@@ -107,7 +108,7 @@ def draw_trial(trial: Trial) -> list[Figure]:
     judged = trial.summary["conditions"]
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     figures += itertools.chain(*(error_plane(trace, side, gains) for side, gains in judged.items()))
-    return [*figures, _hysteresis(trace)] if len(sides) == 2 else figures
+    return [*figures, _hysteresis(trace)] if is_geared else figures
 
 
 _FIGURES = {"motor": "8-9", "load": "12-13"}

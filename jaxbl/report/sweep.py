@@ -24,7 +24,6 @@ from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Column, Distinct, Groups, Rows
 from .maps import best_gains, laws_of, slope_text, worst_runs
-from .panels import SIDES
 
 
 def write_sweep(result: StudyResult, folder: Path) -> str:
@@ -107,9 +106,9 @@ class _Survey:
     def __init__(self, result: StudyResult):
         config = result.config
         paths = config.axis_paths
-        metrics = [f"{side}.{name}" for side in SIDES for name in ("converged", "velocity_rmse", "margin_alpha")]
+        metrics = [f"{side}.{name}" for side in config.sides for name in ("converged", "velocity_rmse", "margin_alpha")]
         metrics = [name for name in metrics if name in result.columns]
-        self.sides = [side for side in SIDES if f"{side}.converged" in metrics]
+        self.sides = [side for side in config.sides if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(config) if config.sweep.refine is not None else None
         self.runs = self.even = self.diverged = 0
@@ -125,7 +124,8 @@ class _Survey:
                 distinct[path].add(frame[[path]])
             for side in self.sides:
                 self.converged[side] += int(even[f"{side}.converged"].sum())
-        ranked = {side: rank_axes(result, f"{side}.velocity_rmse") for side in SIDES if f"{side}.velocity_rmse" in metrics}
+        errors = {side: f"{side}.velocity_rmse" for side in config.sides}
+        ranked = {side: rank_axes(result, error) for side, error in errors.items() if error in metrics}
         self.importance = {side: axes for side, axes in ranked.items() if axes}
         self.values = {path: values.frame()[path] for path, values in distinct.items()}
         for side in self.sides if config.sweep.design == "grid" else []:
@@ -205,7 +205,7 @@ def _law_table(laws: list[Law]) -> ResultTable:
 
 
 def _metric_table(result: StudyResult) -> ResultTable:
-    metrics = {f"{side}.{name}": metric for side, (name, metric) in product(SIDES, SIDE_METRICS.items())}
+    metrics = {f"{side}.{name}": metric for side, (name, metric) in product(result.config.sides, SIDE_METRICS.items())}
     metrics = {column: metric for column, metric in metrics.items() if column in result.columns}
     table, groups = [], Groups(Rows(result, metrics), [])
     for name, metric in metrics.items():

@@ -22,7 +22,6 @@ from .numbers import lead_with_doubt
 from .panels import (
     BLUE,
     MARKERS,
-    SIDES,
     Axis,
     Figure,
     Line,
@@ -39,7 +38,7 @@ from .panels import (
 
 def draw_tuning(tuning: Tuning) -> list[Figure]:
     """All figures of a tuning."""
-    return [draw(tuning, side) for draw in (_map, _limits) for side in SIDES if side in tuning.candidates]
+    return [draw(tuning, side) for draw in (_map, _limits) for side in tuning.config.sides if side in tuning.candidates]
 
 
 def error_label(summary: JsonObject) -> str:
@@ -331,7 +330,7 @@ def _comparison_table(heading: str, gains: list[JsonObject]) -> ResultTable:
         [*(row[key] for key in ("side", "name", "lambda", "alpha")), 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
          row["convergence_time"]["worst"], *(row[key] for key in _MARGINS.values())]
-        for row in sorted(gains, key=lambda row: SIDES.index(row["side"]))
+        for row in sorted(gains, key=lambda row: row["side"] != "motor")
     ]  # fmt: skip
     columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
                "median", "convergence (s)", *_MARGINS]  # fmt: skip

@@ -110,7 +110,7 @@ def _first_axes(config: Config, dims: list[AxisColumns]) -> tuple[int, int]:
     varied = [i for i, dim in enumerate(dims[:-1]) if _length(dim) > 1]
     numbers = {path: i for i in varied for path in dims[i]}
     pairs = [(figure.x, figure.y) for figure in config.figures if figure.kind == "heatmap"]
-    pairs += [(f"observer.{side}.alpha", f"observer.{side}.lambda") for side in ("motor", "load")]
+    pairs += [(f"observer.{side}.alpha", f"observer.{side}.lambda") for side in config.sides]
     for x, y in pairs:
         if x in numbers and y in numbers and numbers[x] != numbers[y]:
             return numbers[x], numbers[y]
