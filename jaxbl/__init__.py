@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         Signals as Signals,
         State as State,
         initial_state as initial_state,
-        step as step,
     )
     from .config import Config as Config, read_config as read_config
     from .control import (
@@ -60,6 +59,7 @@ if TYPE_CHECKING:
         register as register,
         samples as samples,
         simulate as simulate,
+        step as step,
         sweep_arrays as sweep_arrays,
         with_values as with_values,
     )
@@ -104,7 +104,7 @@ if TYPE_CHECKING:
 
 # the same for loading; a test compares the two
 _NAMES = {
-    "chain": "Experiment Run Sample Signals State initial_state step",
+    "chain": "Experiment Run Sample Signals State initial_state",
     "config": "Config read_config",
     "control": (
         "AbstractController AbstractReference Cascade ControllerState Moves Ramp RecordedReference SineReference "
@@ -115,7 +115,7 @@ _NAMES = {
     "drive.excitation": "Chirp Multisine Prbs Recorded Sine Steps",
     "errors": "InputError NoResult",
     "exports": "Export export",
-    "functions": "Grid experiment metrics observe register samples simulate sweep_arrays with_values",
+    "functions": "Grid experiment metrics observe register samples simulate step sweep_arrays with_values",
     "gains.accuracy_laws": "Law accuracy_laws",
     "gains.tune": "Tuning tune",
     "gains.verify": "Verdict verify",

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array
 
+from jaxbl import chain
 from jaxbl.chain import Experiment, NamedArrays, Sample, Signals, TracedArrays, replay, scan, unit_noise
 from jaxbl.config import ConfigSource, read_config
 from jaxbl.config.study import suggest_path
@@ -28,6 +29,7 @@ from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths, set_leaves
 from jaxbl.drive.transmission import TRANSMISSIONS, AbstractTransmission
 from jaxbl.errors import InputError
 from jaxbl.fused import warn_of_scan
+from jaxbl.gradients import warn_when_differentiated
 from jaxbl.observer import OBSERVERS, AbstractObserver
 from jaxbl.registry import Registry
 from jaxbl.sweeps.metrics import (
@@ -148,10 +150,14 @@ def samples(experiment: Experiment, seed: Any = 0) -> Sample:
     return Sample(indices.astype(jnp.result_type(period)) * period, unit_noise(seed, indices, experiment.sides))
 
 
+step = warn_when_differentiated(chain.step)
+
+
 def _record_signals(state: Any, signals: Signals) -> Signals:
     return signals
 
 
+@warn_when_differentiated
 @eqx.filter_jit
 def simulate(experiment: Experiment, seed: Any = 0, *, stride: int = 1) -> Signals:
     """Simulate the experiment with its own input, and return all signals, with a leading time axis.
@@ -164,6 +170,7 @@ def simulate(experiment: Experiment, seed: Any = 0, *, stride: int = 1) -> Signa
     return scan(experiment, seed, record=_record_signals, stride=stride)[1]
 
 
+@warn_when_differentiated
 @eqx.filter_jit
 def observe(experiment: Experiment, u: Array, y: TracedArrays) -> Signals:
     """Run the observers on a record, which takes the place of the drive, and return their signals.
@@ -176,6 +183,7 @@ def observe(experiment: Experiment, u: Array, y: TracedArrays) -> Signals:
     return replay(experiment, u, y, record=_record_signals)[1]
 
 
+@warn_when_differentiated
 @eqx.filter_jit
 def metrics(experiment: Experiment, seed: Any = 0, *, names: tuple[str, ...] | None = None) -> TracedArrays:
     """Compute the metrics of a run, by column such as `motor.velocity_rmse`; memory does not grow with its duration.

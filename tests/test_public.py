@@ -40,6 +40,7 @@ FLOORS = [
     {"chain"},
     {"config", "fused"},
     {"sweeps", "estimation"},
+    {"gradients"},
     {"functions"},
     {"gains", "diagnosis", "exports"},
     {"monitoring"},

@@ -720,11 +720,11 @@ def needs_gain_metrics(names: MetricNames) -> bool:
 
 
 def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
-    """Gains of the experiment's observers by side; empty unless they are super-twisting observers."""
-    fields = ObserverGains._fields
-    if not isinstance(experiment.observer.motor, AbstractSuperTwisting):
+    """Gains of the experiment's observers by side; empty unless all are super-twisting observers."""
+    observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
+    if not all(isinstance(observer, AbstractSuperTwisting) for observer in observers.values()):
         return {}
-    return {s: ObserverGains(*(getattr(getattr(experiment.observer, s), f) for f in fields)) for s in experiment.sides}
+    return {s: ObserverGains(*(getattr(observers[s], field) for field in ObserverGains._fields)) for s in observers}
 
 
 def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> NamedArrays:
