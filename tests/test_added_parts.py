@@ -217,7 +217,8 @@ def test_parts_are_registered_at_any_time(tmp_path):
     assert content["faults"] == [
         "config: excitation.frequency: this key is missing",
         "config: controller.kind: unknown kind 'springs'; did you mean 'spring'?",
-        "register: <class 'int'> should be a class of a drive, input, law, effect, observer, controller, reference or metric",
+        "register: <class 'int'> should be a class of a drive, input, law, effect, observer, controller, reference or "
+        "metric",
         "register: Sine: the name 'sine' is taken",
         "register: Half: should define start, step",
         "register: Nameless: type object 'Nameless' has no attribute 'name'",
