@@ -88,6 +88,6 @@ def _lines(side: str, proof: JsonObject, passed_over: int) -> list[str]:
 
 
 def certificate_tables(summary: JsonObject) -> list[ResultTable]:
-    """What the certificates assume, if there are any."""
+    """A table of what the certificates assume, if there are any."""
     assumptions = [[line] for line in ASSUMPTIONS]
     return [ResultTable("What the certificates assume", ["assumption"], assumptions)] if _proven(summary) else []

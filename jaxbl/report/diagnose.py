@@ -196,12 +196,12 @@ def _table_lines(summary: JsonObject) -> Lines:
         return []
     added, gap = summary["torque_tables"], summary["gap"]
     torques = [
-        f"{side} torque over {_listed([_OVER[table['over']] for table in tables])}"
+        f"{side} torque over {_join_words([_OVER[table['over']] for table in tables])}"
         for side, tables in added["tables"].items()
     ]
     errors = "; ".join(_changes(gap, gap["holdout_rmse_after"], added["holdout_rmse"]).values())
     than = "" if added["holdout_z"] > 0.0 else ", which is no better"
-    return [f"Not named, but added to model.toml as a table: {_listed(torques)}. On held-out data it takes {errors}{than}."]
+    return [f"Not named, but in model.toml as a table: {_join_words(torques)}. On held-out data it takes {errors}{than}."]
 
 
 def _changes(gap: JsonObject, before: Mapping[str, float | None], after: Mapping[str, float | None]) -> dict[str, str]:
@@ -225,10 +225,10 @@ def _names(summary: JsonObject) -> str:
     for finding in summary["findings"]:
         known = finding["confidence"] + sum(other["confidence"] for other in finding["alternatives"])
         names.append(finding["effect"] if known > 0.5 else f"perhaps {finding['effect']}")
-    return _listed(sorted(names, key=lambda name: name.startswith("perhaps ")))
+    return _join_words(sorted(names, key=lambda name: name.startswith("perhaps ")))
 
 
-def _listed(words: Sequence[str]) -> str:
+def _join_words(words: Sequence[str]) -> str:
     """Join words as in a sentence: a, b and c."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 

@@ -78,7 +78,7 @@ def _intervals(result: Identification) -> Figure:
 
 def _residuals(log: LogSignals) -> Figure:
     panels = []
-    for side, sizes in log.found.summary["residual"].items():
+    for side, sizes in log.result.summary["residual"].items():
         unit, rms, noise = log.unit[side], sizes["rms"], sizes["noise"]
         name = f"rms {rms:.2g} {unit}, {rms / noise:.3g} times the noise"
         time, residual = join(log.time, log.record.segments, log[f"{side}.residual"])

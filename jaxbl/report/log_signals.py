@@ -29,15 +29,15 @@ class LogSignals:
         settled: the observed part without its beginning, in which the observers converge.
     """
 
-    def __init__(self, found: Identification):
-        self.found, self.trace, self.record = found, found.trace, found.record
+    def __init__(self, result: Identification):
+        self.result, self.trace, self.record = result, result.trace, result.record
         self.time = self.trace["t"].to_numpy()
         self.sides = [side for side in SIDES if f"{side}.velocity" in self.trace]
         self.geared = "twist" in self.trace
         channels = self.record.statistics.channels
         self.unit = {side: channels[POSITION_CHANNELS[side]].unit for side in self.sides}
         self.torque_unit = "N" if self.unit["motor"] == "m" else "N m"
-        experiment = found.model.build()
+        experiment = result.model.build()
         self.plant, self.time_constant = experiment.plant, float(experiment.equivalent_control.time_constant)
         self.observed = longest_segment(self.record.segments)
         first, last = self.observed.start, self.observed.stop

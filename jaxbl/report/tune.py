@@ -187,7 +187,7 @@ def describe_tuning(tuning: Tuning) -> Result:
     elif "range" in matter:
         verdict, headline = "doubtful", f"Better gains may lie beyond the range searched; of those in it take {chosen}."
     certified = certificate_lines(summary)
-    reserves = {side: min(found["margins"].values()) for side, found in summary["verdict"].items()}
+    reserves = {side: min(entry["margins"].values()) for side, entry in summary["verdict"].items()}
     if thin := [f"{side} × {reserve:.3g}" for side, reserve in reserves.items() if reserve < _LEAST_RESERVE]:
         verdict, headline = "doubtful", f"{headline} Little reserve until they fail or err twice as much: {', '.join(thin)}."
     if beaten := _better_gains(summary):

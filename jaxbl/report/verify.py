@@ -112,28 +112,28 @@ def write_verdict(verdict: Verdict, folder: Path) -> str:
 
 def describe_verdict(verdict: Verdict) -> Result:
     """Say whether the study's own gains and the marked ones are safe, and which conditions are wrong."""
-    marks, levels, own = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
+    marks, levels, own_gains = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
     exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
     failures = sum(entry["counterexamples"] for _, entry in exact)
     extent = (
         f"{levels[0]['cells']} cells of the error system and {sum(level['cells'] for level in levels[1:])} runs of the drive"
     )
-    missed = [f"the study's gains, {side}" for side, judged in own.items() if not judged["holds"]["exact"]]
+    missed = [f"the study's gains, {side}" for side, judged in own_gains.items() if not judged["holds"]["exact"]]
     word, headline = "good", f"No counterexample to the exact gain condition in {extent}."
     # marks are there to be compared; the answer is about the user's own gains, if there are any
-    if missed or (unsafe and not own):
+    if missed or (unsafe and not own_gains):
         word, names = "failed", "; ".join(missed or unsafe)
         headline = f"Not safe: {names}. A disturbance within f⁺ can keep the error from dying out."
-    elif own or marks:
-        whose = "study's own" if own else "marked"
+    elif own_gains or marks:
+        whose = "study's own" if own_gains else "marked"
         headline = f"The {whose} gains are safe: any disturbance within f⁺ dies out in finite time."
         headline += f" Of those marked not safe: {'; '.join(unsafe)}." if unsafe else ""
     elif failures:
         word, headline = "doubtful", f"The observer failed in {failures} of {extent} although the exact gain condition held."
     margins = [
         (judged["lambda"] / least, f"the study's gains, {side}")
-        for side, judged in own.items()
+        for side, judged in own_gains.items()
         if (least := judged["least_lambda"]["exact"])
     ]
     margins += [(gains["margin_exact"], gains["name"]) for gains in marks]
@@ -151,7 +151,7 @@ def describe_verdict(verdict: Verdict) -> Result:
         tables.insert(0, _mark_table(marks))
     if margins := verdict.summary["loop_margins"]:
         tables.append(margin_table(margins))
-    remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own.items()]
+    remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own_gains.items()]
     remarks += [*map(_mark_line, marks), *_level_lines(verdict)]
     title = verdict.config.title or "Gain conditions"
     return Result(title, word, headline, figures, remarks, verdict.config.notes, tables)
