@@ -112,16 +112,16 @@ class Groups:
         rows: number of all rows.
     """
 
-    def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], others: Sequence[str] = ()):
+    def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], further: Sequence[str] = ()):
         self._rows, self._keys = rows, list(keys)
         distinct, first = Distinct(), {}
         self.varied: set[str] = set()
         self.rows = 0
-        for frame in _read_columns(rows, [*self._keys, *others]):
+        for frame in _read_columns(rows, [*self._keys, *further]):
             self.rows += len(frame)
             if self._keys:
                 distinct.add(frame[self._keys])
-            for name in others if len(frame) else ():
+            for name in further if len(frame) else ():
                 column = frame[name].to_numpy()
                 if (column != first.setdefault(name, column[0])).any():
                     self.varied.add(name)

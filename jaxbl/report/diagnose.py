@@ -223,8 +223,8 @@ def _names(summary: JsonObject) -> str:
     """Names of the effects that were found, as in a sentence; what may as well be something unknown is there perhaps."""
     names = []
     for finding in summary["findings"]:
-        known = finding["confidence"] + sum(other["confidence"] for other in finding["alternatives"])
-        names.append(finding["effect"] if known > 0.5 else f"perhaps {finding['effect']}")
+        confidence = finding["confidence"] + sum(other["confidence"] for other in finding["alternatives"])
+        names.append(finding["effect"] if confidence > 0.5 else f"perhaps {finding['effect']}")
     return _join_words(sorted(names, key=lambda name: name.startswith("perhaps ")))
 
 
