@@ -11,6 +11,7 @@ jaxonomy is left out where it is not installed (`pip install jaxonomy`, beside j
 """
 
 import argparse
+import importlib.util
 import inspect
 import time
 from collections.abc import Callable
@@ -179,10 +180,12 @@ def measure(name: str, settings: list[Any], lanes: int, steps: int) -> None:
         motor = solve_by_scipy(steps, gaps[0])[-(steps // 4) :, 0]
         target = AMPLITUDE * np.sin(RATE * PERIOD * np.arange(steps - steps // 4, steps))
         expected = np.sqrt(np.mean((target - motor) ** 2))
+        samples = lanes * steps / warm
         print(
             f"{name} {options or ''}: setting {setting}, load within {error:.1e} rad, "
-            f"{count_lines(make, run, batch)} lines, first result {first:.1f} s, {lanes} drives in {warm:.2f} s ({lanes * steps / warm:.3g} samples/s; with "
-            f"compilation {cold:.1f} s), following error {errors[0]:.6f} rad (SciPy {expected:.6f})",
+            f"{count_lines(make, run, batch)} lines, first result {first:.1f} s, "
+            f"{lanes} drives in {warm:.2f} s ({samples:.3g} samples/s; with compilation {cold:.1f} s), "
+            f"following error {errors[0]:.6f} rad (SciPy {expected:.6f})",
             flush=True,
         )
 
@@ -193,9 +196,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000)
     arguments = parser.parse_args()
     measure("jaxbl", [1, 2, 4, 8, 16, 32], arguments.lanes, arguments.steps)
-    try:
-        import jaxonomy  # noqa: F401
-    except ImportError:
+    if importlib.util.find_spec("jaxonomy") is None:
         print("jaxonomy is not installed: left out")
         return
     measure("jaxonomy", [1e-3, 5e-4, 2e-4, 1e-4, 5e-5], arguments.lanes, arguments.steps)
