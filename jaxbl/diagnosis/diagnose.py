@@ -14,6 +14,7 @@ from jaxbl.chain import Experiment
 from jaxbl.config import Config, ConfigSource
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
+from jaxbl.estimation.feedback_bias import find_feedback_bias
 from jaxbl.estimation.free_parameters import free_values
 from jaxbl.estimation.logs import Logs, arrays, gains_for
 from jaxbl.estimation.segments import at_period
@@ -161,7 +162,8 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         views, notes = describe_observers(observing, observed[0], setup)
         for side, witness in views.items():
             summary["where"][side]["observed"] = witness
-        summary["notes"] += notes
+        summary["feedback"] = find_feedback_bias(task.record, setup.fitted.segments, fitted.experiment)
+        summary["notes"] += [there["sentence"] for there in summary["feedback"].values()] + notes
         summary["contradictions"] = contradictions_of(task.record, fitted, apart)
         summary["gap"] = proof.gap | summarise_test(judgement, proof)
         if judgement.verdict == "unknown_effect":

@@ -95,7 +95,7 @@ def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     last = tuple(slice(max(part.start, row), part.stop) for part in record.segments if part.stop > row)
     cut = {
         name: None if (values := getattr(record, name)) is None else values[:row]
-        for name in ("time", "torque", "transmitted")
+        for name in ("time", "torque", "transmitted", "reference")
     }
     positions = {side: values[:row] for side, values in record.positions.items()}
     # times count from the log's first sample in both: a disturbance may be periodic in time

@@ -22,6 +22,7 @@ from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records import Record
 from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
+from .feedback_bias import find_feedback_bias
 from .free_parameters import FreeParameter, free_values, make_free_parameters
 from .identification_summary import by_regression, by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
@@ -159,7 +160,8 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         done()
         summary = summary_of(task, fitted, search_fit, profiles) | {"method": method}
         summary["torque"] = torque_errors(record, fitted, parts, factor)
-        summary["notes"] = [*summary["notes"], *damping]
+        summary["feedback"] = bias = find_feedback_bias(record, segments, fitted)
+        summary["notes"] = [*(there["sentence"] for there in bias.values()), *summary["notes"], *damping]
         if summary["rejected"]:
             mark_lacking(summary, find_motion_share(fitted, parts, factor))
         if gains:

@@ -57,7 +57,7 @@ class SealedRecord:
 
 def _hash_of(record: Record) -> bytes:
     total = hashlib.sha256(str(record.segments).encode())
-    for values in (record.time, record.torque, *record.positions.values(), record.transmitted):
+    for values in (record.time, record.torque, *record.positions.values(), record.transmitted, record.reference):
         total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
     return total.digest()
 

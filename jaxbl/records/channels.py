@@ -65,6 +65,8 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
         torques["transmitted"] = table.transmitted
     for name, torque in torques.items():
         channels[name] = _read_torque(file, name, torque, stamps, is_linear=is_linear)
+    if table.reference is not None:
+        channels["reference"] = _read_reference(file, table.reference, stamps)
     # a test rig compares displacement and torque at the same instants
     if "u" in channels and (table.kind == "drive" or table.hold != "sampled"):
         channels["u"] = channels["u"]._replace(hold=table.hold or "zoh")
@@ -161,6 +163,13 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
     if np.ptp(values) < _LEAST_MOTION:
         raise file.error(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
     return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, drift=table.drift or 0.0)
+
+
+def _read_reference(file: LogFile, table: PositionTable, stamps: TimeStamps) -> RawChannel:
+    """Read what a controller was given: it may stand still or jump."""
+    values = _read_numbers(file, "reference", table.column_or("reference"), table, stamps)
+    values = to_si(table, values if table.wrap is None else _unwrap(file, "reference", table, values))
+    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0)
 
 
 def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:

@@ -76,6 +76,7 @@ class Record:
             if it was not recorded.
         positions: "motor" and "load", if recorded -> rad (m on a linear axis), shape (samples,).
         transmitted: measured transmitted torque, N m (N), shape (samples,), or None.
+        reference: position that a controller was given, rad (m), shape (samples,), or None.
         closed_loop: True if a controller chose the input from the positions; None if not known.
         start: time of the first sample by the stamps of the log, s.
         segments: samples of each segment; between them the log has gaps.
@@ -95,6 +96,7 @@ class Record:
     torque: np.ndarray | None
     positions: dict[str, np.ndarray]
     transmitted: np.ndarray | None
+    reference: np.ndarray | None
     closed_loop: bool | None
     start: float
     segments: tuple[slice, ...]
@@ -213,6 +215,7 @@ def read_record(
         torque=grid.values.get("u"),
         positions={side: grid.values[name] for side, name in POSITION_CHANNELS.items() if name in channels},
         transmitted=grid.values.get("transmitted"),
+        reference=grid.values.get("reference"),
         closed_loop=table.closed_loop,
         start=stamps.start + float(grid.time[0]),
         segments=tuple(grid.segments),
@@ -502,6 +505,7 @@ def join_records(records: Sequence[Record]) -> Record:
         torque=joined.get("torque"),
         positions={side: joined[f"{side} position"] for side in first.positions},
         transmitted=joined.get("transmitted torque"),
+        reference=joined.get("reference"),
         segments=tuple(segments),
         notes=tuple(notes),
         warnings=tuple(warnings),
@@ -518,6 +522,6 @@ def _require_channels(record: Record, names: Iterable[str], other: Record) -> No
 
 
 def _list_channels(record: Record) -> dict[str, np.ndarray]:
-    torques = {"torque": record.torque, "transmitted torque": record.transmitted}
+    torques = {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
     positions = {f"{side} position": values for side, values in record.positions.items()}
     return positions | {name: values for name, values in torques.items() if values is not None}

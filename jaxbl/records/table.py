@@ -204,6 +204,9 @@ class LogTable(StrictTable):
     omega_e: SpeedTable | None = _optional("motor speed, in place of theta_e; left out: none")
     omega_s: SpeedTable | None = _optional("load speed, in place of theta_s; left out: none")
     transmitted: TorqueTable | None = _optional("measured transmitted torque; left out: none")
+    reference: PositionTable | None = _optional(
+        "position that a controller was given: with it, identify and diagnose test for bias by feedback; left out: none"
+    )
     absent: list[_ChannelName] | None = _optional("channels that were not recorded, of u, theta_e, theta_s; left out: none")
     join: list[str] | None = _optional(
         "files beside the log with more columns, which are then named FILE/COLUMN (FILE without its ending); each has times "
@@ -237,9 +240,9 @@ class LogTable(StrictTable):
         if self.kind == "element":
             if "u" in absent or "theta_e" in absent:
                 raise table_error(f"absent: {ELEMENT_NEEDS}")
-            if self.omega_e is not None or self.omega_s is not None or self.transmitted is not None:
+            if self.omega_e is not None or self.omega_s is not None or self.transmitted or self.reference:
                 raise table_error(
-                    "an element has a displacement (theta_e, theta_s) and a torque u, no speed and no transmitted"
+                    "an element has a displacement (theta_e, theta_s) and a torque u, no speed, transmitted or reference"
                 )
         if "theta_e" in absent and "theta_s" in absent:
             raise table_error("absent: a log without theta_e and theta_s has no position; one of them is needed")
@@ -254,7 +257,7 @@ class LogTable(StrictTable):
     @property
     def channels(self) -> dict[str, TimeTable | PositionTable | SpeedTable | TorqueTable | None]:
         """Tables of time and channels; None if they are left out."""
-        names = ("t", "u", *POSITION_CHANNELS.values(), *SPEED_CHANNELS.values(), "transmitted")
+        names = ("t", "u", *POSITION_CHANNELS.values(), *SPEED_CHANNELS.values(), "transmitted", "reference")
         return {name: getattr(self, name) for name in names}
 
     def list_columns(self) -> set[ColumnName]:

@@ -1,0 +1,71 @@
+"""Bias by feedback: a log of a closed loop is tested with its reference as an instrument.
+
+A controller answers to noise and disturbances, so that input and motion go with them, and least squares take them for the
+drive. The reference does not know them: what a model leaves over must not go with it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxbl.chain import Experiment
+from jaxbl.json_types import JsonObject
+from jaxbl.records import Record
+
+from .regression import balance
+from .segments import Segment
+
+_BLOCKS = 40
+"""Blocks of a log, whose sums vary as all errors do, those that last for many samples included."""
+_EDGE = 10
+"""Samples at both ends of a segment where the smoothed motion is uncertain."""
+_SIGNIFICANT = 1e-3
+"""Probability of so large a shift without a bias, below which one is said."""
+
+
+def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Experiment) -> JsonObject:
+    """Find by how much the reference as an instrument shifts inertia and viscous friction of each side.
+
+    With residual r = u - J a - f v, motion X = (a, v) and instruments Z = (acceleration and velocity of the reference), the
+    shift is (Z'X)^-1 Z'r; its covariance is that of sums over blocks. Reference: J. A. Hausman, Econometrica 46 (1978).
+
+    Returns:
+        By side `inertia` and `viscous`, each with `shift`, `standard_error`, `unit`; `probability` of a shift as large by
+        chance; whether it is `biased`; and a `sentence`. Empty for a log without a reference.
+    """
+    if record.reference is None:
+        return {}
+    period, found = record.sample_period, {}
+    parts = [segment for segment in segments if len(segment) > 4 * _EDGE]
+    velocities = [np.gradient(record.reference[part.rows], period) for part in parts]
+    inside = slice(_EDGE, -_EDGE)
+    instruments = np.concatenate([np.stack([np.gradient(v, period), v], 1)[inside] for v in velocities])
+    balances = [balance(fitted, part.kinematics) for part in parts]
+    for side in fitted.sides:
+        motion = np.concatenate(
+            [np.stack([k.acceleration[side], k.velocity[side]], 1)[inside] for k in (part.kinematics for part in parts)]
+        )
+        residual = np.concatenate([np.asarray(equations[side].residual)[inside] for equations in balances])
+        product = instruments.T @ motion
+        if np.linalg.matrix_rank(product) < 2:
+            sentence = f"{side}: the reference does not move; bias by feedback cannot be tested for."
+            found[side] = {"biased": None, "sentence": sentence}
+            continue
+        shift = np.linalg.solve(product, instruments.T @ residual)
+        terms = instruments * (residual - motion @ shift)[:, None]
+        sums = np.stack([block.sum(axis=0) for block in np.array_split(terms, _BLOCKS)])
+        covariance = np.linalg.solve(product, np.linalg.solve(product, sums.T @ sums).T)
+        # of two numbers
+        probability = float(np.exp(-0.5 * shift @ np.linalg.solve(covariance, shift)))
+        numbers = {
+            name: {"shift": value, "standard_error": error, "unit": record.unit_of(f"{side}.{name}", unit)}
+            for name, unit, value, error in zip(
+                ("inertia", "viscous"), ("kg m²", "N m s/rad"), shift, np.sqrt(np.diag(covariance)), strict=True
+            )
+        }
+        biased = probability < _SIGNIFICANT
+        verdict = "numbers are biased by feedback, or an effect is missing" if biased else "no bias by feedback is seen"
+        sizes = ", ".join(f"{n} {q['shift']:+.2g} ± {q['standard_error']:.2g} {q['unit']}" for n, q in numbers.items())
+        sentence = f"{side}: {verdict}; with the reference as instrument: {sizes} (p = {probability:.2g})."
+        found[side] = numbers | {"probability": probability, "biased": biased, "sentence": sentence}
+    return found
