@@ -41,7 +41,7 @@ class _FileTable(Table):
         return float(times[-1])
 
     def _load_columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times from the first one on, s, and the signal, shape (rows,). Raises `InputError`."""
+        """Load times from the first one on, s, and the signal, shape (rows,). Raises `InputError`."""
         path, column = (
             Path(self.file),
             next(value for name, value in self if name.endswith("_column") and name != "time_column"),

@@ -35,7 +35,7 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
     """
     if record.reference is None:
         return {}
-    period, found = record.sample_period, {}
+    period, bias_by_side = record.sample_period, {}
     parts = [segment for segment in segments if len(segment) > 4 * _EDGE]
     velocities = [np.gradient(record.reference[part.rows], period) for part in parts]
     inside = slice(_EDGE, -_EDGE)
@@ -49,7 +49,7 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
         product = instruments.T @ motion
         if np.linalg.matrix_rank(product) < 2:
             sentence = f"{side}: the reference does not move; bias by feedback cannot be tested for."
-            found[side] = {"biased": None, "sentence": sentence}
+            bias_by_side[side] = {"biased": None, "sentence": sentence}
             continue
         shift = np.linalg.solve(product, instruments.T @ residual)
         terms = instruments * (residual - motion @ shift)[:, None]
@@ -67,5 +67,5 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
         verdict = "numbers are biased by feedback, or an effect is missing" if biased else "no bias by feedback is seen"
         sizes = ", ".join(f"{n} {q['shift']:+.2g} ± {q['standard_error']:.2g} {q['unit']}" for n, q in numbers.items())
         sentence = f"{side}: {verdict}; with the reference as instrument: {sizes} (p = {probability:.2g})."
-        found[side] = numbers | {"probability": probability, "biased": biased, "sentence": sentence}
-    return found
+        bias_by_side[side] = numbers | {"probability": probability, "biased": biased, "sentence": sentence}
+    return bias_by_side

@@ -70,7 +70,7 @@ class LoopRuns:
         self.table, self.stages, self.side = table, stages, config.controller.side
         self.scenarios, self.experiment = list_scenarios(config, table), config.build()
 
-    def own_gains(self, paths: Sequence[str]) -> GainValues:
+    def read_study_gains(self, paths: Sequence[str]) -> GainValues:
         """Return the study's own gains."""
         return {path: float(get_leaf(self.experiment, path) or 0.0) for path in paths}
 
@@ -98,15 +98,17 @@ class LoopRuns:
         tolerance = self.experiment.run.position_tolerance / self.experiment.drive.ratio(self.side)
 
         def try_factors(factors: Mapping[Any, np.ndarray], stage: str) -> tuple[dict[Any, np.ndarray], float]:
-            sets = [gains | {path: gains[path] * factor**way} for (path, way), tried in factors.items() for factor in tried]
+            sets = [
+                gains | {path: gains[path] * factor**way} for (path, way), ladder in factors.items() for factor in ladder
+            ]
             columns = {path: [gains[path], *(values[path] for values in sets)] for path in gains}
             ranges = self.simulate(f"{name}-{stage}", columns)["limit_cycle_amplitude"].max(axis=1)
             holds = ranges[1:] <= max(tolerance, 2.0 * ranges[0])
-            ends = np.cumsum([len(tried) for tried in factors.values()])
+            ends = np.cumsum([len(ladder) for ladder in factors.values()])
             return dict(zip(factors, np.split(holds, ends[:-1]), strict=True)), float(ranges[0])
 
-        holds, own = try_factors({(path, way): _COARSE for path in gains for way in (-1, 1)}, "coarse")
-        if not np.isfinite(own):
+        holds, given_range = try_factors({(path, way): _COARSE for path in gains for way in (-1, 1)}, "coarse")
+        if not np.isfinite(given_range):
             return {}
         first_failures = {key: int(np.argmin(there)) for key, there in holds.items() if not there.all()}
         ladders = {key: _COARSE[i] * _COARSE[0] ** (_FINE / len(_FINE) - 1.0) for key, i in first_failures.items()}
@@ -127,13 +129,13 @@ def tune_loop(config: Config, table: TuneTable, stages: Stages) -> LoopTuning:
     stages.write_manifest()
     runs, objective = LoopRuns(config, table, stages), LOOP_OBJECTIVES[table.objective]
     limits = _find_ranges(config, table, runs)
-    own, search = runs.own_gains(list(limits)), SideSearch(limits, dict(limits), {}, widest_cell=_ZOOM)
+    study_gains, search = runs.read_study_gains(list(limits)), SideSearch(limits, dict(limits), {}, widest_cell=_ZOOM)
     stages.total_lanes = (1 + table.refine) * table.trials * config.sweep.seeds * len(runs.scenarios.names)
     tables = []
     for stage in range(1 + table.refine):
         trials = search.trial_gains(draw_sobol(len(limits), table.trials, stage))
         if stage == 0:
-            trials = {path: np.append(own[path], values) for path, values in trials.items()}
+            trials = {path: np.append(study_gains[path], values) for path, values in trials.items()}
         worst = {name: values.max(axis=1) for name, values in runs.simulate(f"loop-{stage}", trials).items()}
         keeps = (worst["settling_time"] <= (table.longest_settling or np.inf)) & (
             worst["limit_cycle_amplitude"] <= (table.largest_limit_cycle or np.inf)
@@ -144,7 +146,7 @@ def tune_loop(config: Config, table: TuneTable, stages: Stages) -> LoopTuning:
     if not search.best:
         raise NoResult("tune: no gains of the loop stay finite and keep longest_settling and largest_limit_cycle")
     best = {path: float(f"{value:.6g}") for path, value in search.best.items()}
-    summary = _summarise(runs, best, own, search) | {"margins": runs.find_margins(best)}
+    summary = _summarise(runs, best, study_gains, search) | {"margins": runs.find_margins(best)}
     return LoopTuning(config, to_jsonable(summary), pd.concat(tables), stages.cost, tuple(stages.fallback_reasons))
 
 
@@ -157,7 +159,7 @@ def _find_ranges(config: Config, table: TuneTable, runs: LoopRuns) -> dict[str, 
             raise InputError(f"tune.gains[{i}].path: unknown path '{path}'; {suggest_path(path, paths)}")
     for side in () if ranges else runs.experiment.sides:
         ranges |= {f"observer.{side}.{key}": (None, None) for key in getattr(runs.experiment.observer, side).gains()}
-    for path, value in runs.own_gains([path for path, ends in ranges.items() if None in ends]).items():
+    for path, value in runs.read_study_gains([path for path, ends in ranges.items() if None in ends]).items():
         if not value > 0.0:
             raise InputError(f"tune.gains: {path} is {value:g} in the study; give its start and stop in [[tune.gains]]")
         low, high = ranges[path]
@@ -165,12 +167,12 @@ def _find_ranges(config: Config, table: TuneTable, runs: LoopRuns) -> dict[str, 
     return ranges
 
 
-def _summarise(runs: LoopRuns, best: GainValues, own: GainValues, search: SideSearch) -> JsonObject:
+def _summarise(runs: LoopRuns, best: GainValues, study_gains: GainValues, search: SideSearch) -> JsonObject:
     """Compare tuned gains with the study's own under other noise: content of `tuning.json`."""
     config, table = runs.scenarios.config, runs.table
     objective, seeds = LOOP_OBJECTIVES[table.objective], max(config.sweep.seeds, LEAST_HELD_OUT_SEEDS)
-    sets = {"tuned": best} | ({} if best == own else {"study": own})
-    found = runs.simulate("loop-holdout", {path: [gains[path] for gains in sets.values()] for path in best}, seeds)
+    sets = {"tuned": best} | ({} if best == study_gains else {"study": study_gains})
+    metrics = runs.simulate("loop-holdout", {path: [gains[path] for gains in sets.values()] for path in best}, seeds)
     return {
         "title": config.title,
         "objective": table.objective,
@@ -182,8 +184,8 @@ def _summarise(runs: LoopRuns, best: GainValues, own: GainValues, search: SideSe
         "error_in_search": search.error,
         "at_range_end": search.gains_at_ends(),
         "compared": {
-            name: {"gains": gains} | {metric: values[i].max() for metric, values in found.items()}
+            name: {"gains": gains} | {metric: values[i].max() for metric, values in metrics.items()}
             for i, (name, gains) in enumerate(sets.items())
         },
-        "ranking": rank_kinds(dict(zip(sets, found[objective], strict=True))),
+        "ranking": rank_kinds(dict(zip(sets, metrics[objective], strict=True))),
     }

@@ -154,7 +154,7 @@ def _find_loop_margins(config: Config, stages: Stages) -> JsonObject:
     if config.controller is None:
         return {}
     runs = LoopRuns(config, TuneTable(), stages)
-    gains = runs.own_gains([path for path in config.axis_paths if path.startswith(GAIN_SECTIONS)])
+    gains = runs.read_study_gains([path for path in config.axis_paths if path.startswith(GAIN_SECTIONS)])
     return runs.find_margins({path: gain for path, gain in gains.items() if gain > 0.0})
 
 

@@ -19,12 +19,12 @@ from .tune import for_title
 
 
 def draw_loop_tuning(tuning: LoopTuning) -> list[Figure]:
-    """The error of all gains tried, over each gain."""
-    summary, tried, panels = tuning.summary, tuning.candidates, []
+    """Draw the error of all candidates over each gain."""
+    summary, candidates, panels = tuning.summary, tuning.candidates, []
     metric = find_metric(summary["objective_metric"].split()[0])
     for path, gain in summary["gains"].items():
         parts = [
-            cloud(tried[path], tried["error"], "tried", BLUE, marker="o", size=3.0),
+            cloud(candidates[path], candidates["error"], "tried", BLUE, marker="o", size=3.0),
             mark(gain, summary["error_in_search"], "tuned", "*", 12.0, VERMILION),
         ]
         axes = Axis(axis_label(tuning.config, path), path, log=True), Axis(with_unit(metric.label, metric.unit), log=True)
@@ -80,7 +80,7 @@ def describe_loop_tuning(tuning: LoopTuning) -> Result:
 
 
 def margin_table(margins: JsonObject) -> ResultTable:
-    """Table of the factors by which each gain of a loop may fall and rise."""
+    """Make a table of the factors by which each gain of a loop may fall and rise."""
     rows = [[path, *(margin[way] or "64 and more" for way in ("down", "up"))] for path, margin in margins.items()]
     heading = "Factors by which a gain alone may change until the following error's range is twice as wide"
     return ResultTable(heading, ["gain", "divided by", "multiplied by"], rows)
