@@ -129,10 +129,10 @@ def run_element(task: ElementTask) -> ElementIdentification:
         )
     stiffness = element.numbers["stiffness"]
     if "stiffness" in element.open or stiffness.value <= 0.0:
-        others = element.numbers.keys() - {"stiffness", "offset", "centre", *element.open}
-        found = "".join(f"; what it shows: {name} {element.numbers[name]}" for name in sorted(others))
+        names = element.numbers.keys() - {"stiffness", "offset", "centre", *element.open}
+        shown = "".join(f"; what it shows: {name} {element.numbers[name]}" for name in sorted(names))
         raise InputError(
-            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){found}; "
+            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){shown}; "
             "see columns and signs in [log]"
         )
     moved = element_displacement(record, task.gear_ratio)
