@@ -129,10 +129,10 @@ def run_element(task: ElementTask) -> ElementIdentification:
         )
     stiffness = element.numbers["stiffness"]
     if "stiffness" in element.open or stiffness.value <= 0.0:
-        names = element.numbers.keys() - {"stiffness", "offset", "centre", *element.open}
-        shown = "".join(f"; what it shows: {name} {element.numbers[name]}" for name in sorted(names))
+        determined = element.numbers.keys() - {"stiffness", "offset", "centre", *element.open}
+        remark = "".join(f"; what it shows: {name} {element.numbers[name]}" for name in sorted(determined))
         raise InputError(
-            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){shown}; "
+            f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){remark}; "
             "see columns and signs in [log]"
         )
     moved = element_displacement(record, task.gear_ratio)
