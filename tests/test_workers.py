@@ -223,6 +223,7 @@ def test_what_windows_has_not_is_not_needed(tmp_path):
         "export study.toml --out code",
         "simulate gap.toml --out gap",
         "inspect gap/trace.parquet --out seen",
+        "identify gap/trace.parquet --model gap.toml --out found",
         "watch gap/trace.parquet --model gap.toml --window 0.5 --every 0.2 --out watched",
     )
     program = [sys.executable, Path(__file__).parent / "windows.py", *commands]
@@ -237,7 +238,7 @@ def test_what_windows_has_not_is_not_needed(tmp_path):
         env=environment | {"XDG_CACHE_HOME": str(tmp_path)},
     )
     assert result.returncode == 0, result.stderr
-    folders = "run", "map", "shared", "compared", "gap", "seen", "watched"
+    folders = "run", "map", "shared", "compared", "gap", "seen", "found", "watched"
     assert all((tmp_path / folder / "report.html").is_file() for folder in folders)
     assert not list(tmp_path.rglob(".lock"))
 
