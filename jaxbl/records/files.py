@@ -358,11 +358,13 @@ def _check_lines(path: Path) -> None:
 def _read_parquet(path: Path) -> Columns:
     from pyarrow.parquet import ParquetFile
 
-    with ParquetFile(path) as file:
-        names, rows = [str(name) for name in file.schema_arrow.names], file.metadata.num_rows
+    # opened here, as the library takes names in UTF-8 alone
+    with path.open("rb") as opened, ParquetFile(opened) as file:
+        names, rows = file.schema_arrow.names, file.metadata.num_rows
 
     def load_column(name: str) -> np.ndarray:
-        values = pd.read_parquet(path, columns=[name])[name]
+        with path.open("rb") as opened:
+            values = pd.read_parquet(opened, columns=[name])[name]
         if isinstance(values.dtype, pd.DatetimeTZDtype):
             values = values.dt.tz_convert(None)
         return values.to_numpy()

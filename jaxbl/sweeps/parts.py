@@ -79,8 +79,9 @@ def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool =
         FileNotFoundError: there is none.
     """
     try:
-        source = BytesIO(_read_checked(path)) if check or is_remote(path) else path
-        with pq.ParquetFile(source, page_checksum_verification=True) as file:
+        # opened here, as the library takes names in UTF-8 alone
+        source = BytesIO(_read_checked(path)) if check or is_remote(path) else path.open("rb")
+        with source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             header = json.loads((file.schema_arrow.metadata or {})[_KEY])
             # no columns: the header alone
             frame = pd.DataFrame() if columns == () else file.read(columns=columns).to_pandas()

@@ -1,6 +1,7 @@
 """Columns out of files of every kind."""
 
 import json
+import os
 import struct
 import sys
 from contextlib import suppress
@@ -386,6 +387,17 @@ def write_bag(path):
             head = header(stamp(*divmod(time, 10**9)), "")
             message = state(head, ["a"], np.array([t]), np.array([]), np.array([u]))
             writer.write(topic, time + 5_000_000, store.serialize_cdr(message, state.__msgtype__))
+
+
+@pytest.mark.parametrize("folder", [b"b\xffd", b"\xe9", b"a\xc3", b"\xed\xa0\x80"])
+def test_a_folder_may_have_a_name_that_is_no_utf8(tmp_path, folder):
+    """Parquet's library takes none: "cannot be read as Parquet, write it anew" was said of a sound log."""
+    place = tmp_path / os.fsdecode(folder)
+    place.mkdir()
+    pd.DataFrame({"t": T, "u": U}).to_parquet(tmp_path / "log.parquet")
+    (tmp_path / "log.parquet").rename(place / "log.parquet")
+    file = read_log_file(place / "log.parquet")
+    np.testing.assert_array_equal([file.load_numbers(name) for name in "tu"], [T, U])
 
 
 @pytest.mark.parametrize("member", ['"u": 2', '"x": {"y": 1, "z": 2, "y": 3}', '"x": [{"y": 1, "y": 1}]'])

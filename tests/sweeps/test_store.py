@@ -1,6 +1,7 @@
 """A study's folder: what belongs to it, restart, and nothing overwritten."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,12 @@ def test_what_a_study_leaves(finished_study):
     pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), result.frame)
     # the same as without a folder
     pd.testing.assert_frame_equal(sweep(study()).frame, result.frame)
+
+
+def test_a_study_is_read_from_a_folder_whose_name_is_no_utf8(tmp_path, finished_study, study_copy):
+    """Sound parts were called damaged."""
+    folder = study_copy.rename(tmp_path / os.fsdecode(b"b\xffd"))
+    pd.testing.assert_frame_equal(open_study(folder).read(), open_study(finished_study[0]).read())
 
 
 def test_finished_study_is_only_read(study_copy, finished_study, computed_chunks):
