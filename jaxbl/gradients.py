@@ -29,10 +29,10 @@ def warn_when_differentiated(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def run(experiment: Experiment, *arrays: Any, **options: Any) -> Any:
-        numbers, others = eqx.partition((experiment, arrays), eqx.is_inexact_array)
+        numbers, not_numbers = eqx.partition((experiment, arrays), eqx.is_inexact_array)
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(numbers)):
             return function(experiment, *arrays, **options)
-        experiment, arrays = eqx.combine(_watch(numbers, functools.partial(_explain, experiment)), others)
+        experiment, arrays = eqx.combine(_watch(numbers, functools.partial(_explain, experiment)), not_numbers)
         return function(experiment, *arrays, **options)
 
     return run  # type: ignore[return-value]
@@ -69,8 +69,8 @@ def _explain(experiment: Experiment, paths: list[str]) -> str:
     is_closed = experiment.controller is not None
     # another side's observer matters where a controller reads it
     for side in experiment.sides:
-        others = {side} if is_closed else {*experiment.sides} - {side}
-        reached = [key for key in keys if is_closed or key[:1] != ["observer"] or key[1] not in others]
+        elsewhere = {side} if is_closed else {*experiment.sides} - {side}
+        reached = [key for key in keys if is_closed or key[:1] != ["observer"] or key[1] not in elsewhere]
         if reached and isinstance(getattr(experiment.observer, side), AbstractSuperTwisting):
             return f"the super-twisting observer of the {side}"
     fed_back = is_closed or any(path.startswith(("1", "2")) for path in paths)

@@ -274,8 +274,8 @@ def _find_fault(folder: Path) -> str:
         if status.st_uid != user and not (above and status.st_uid == system):
             return f"{place}: is another user's"
         # a sticky folder lets nobody move what is another's; where users have groups of their own, these may write
-        others = 0o002 if above and status.st_gid == group else 0o022
-        if status.st_mode & others and not (above and status.st_mode & stat.S_ISVTX):
+        write_bits = 0o002 if above and status.st_gid == group else 0o022
+        if status.st_mode & write_bits and not (above and status.st_mode & stat.S_ISVTX):
             remedy = "chmod go-w closes it" if above else "remove it, to have it made anew"
             return f"{place}: can be written to by others; {remedy}"
     return ""

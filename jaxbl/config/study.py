@@ -178,7 +178,7 @@ _MOST_SUBSTEPS = next(parameter.maximum for field, parameter in parameters(Run) 
 
 
 def _check_sides(config: Config) -> None:
-    """What is connected by a law needs one, each side its observer, and the gear steps that resolve it."""
+    """Require a law where two sides are connected by one, an observer of each side, and steps that resolve the gear."""
     kind, cls, rigid = config.drive.kind, DRIVES[config.drive.kind], "load" not in config.sides
     if config.transmission is not None and "load" not in (*cls.sides, *cls.hidden):
         raise table_error(f"[transmission] has no meaning on a {kind} drive; remove it, or use drive.kind = 'two_inertia'")
@@ -187,10 +187,10 @@ def _check_sides(config: Config) -> None:
     compared_tables = () if config.tune is None else config.tune.compare
     gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(compared_tables)}
     for name, table in gains.items():
-        given = {"motor", *(table.model_extra or {})} | (set() if table.load is None else {"load"})
-        for side in sorted(given - {*config.sides}):
+        with_table = {"motor", *(table.model_extra or {})} | (set() if table.load is None else {"load"})
+        for side in sorted(with_table - {*config.sides}):
             raise table_error(f"{name}.{side} has no meaning on a {kind} drive; remove it")
-        for side in sorted({*config.sides} - given):
+        for side in sorted({*config.sides} - with_table):
             raise table_error(f"{name}.{side} is missing: a {kind} drive has a {side} observer; give its lambda and alpha")
     if rigid and config.controller is not None and config.controller.side == "load":
         raise table_error(f"controller.side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
