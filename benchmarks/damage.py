@@ -155,9 +155,9 @@ def call(folder: Path, words: str) -> tuple[int, str]:
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
-    """All files of a folder with their bytes, pages without their remarks, of which one tells how long compiling took."""
+    """All files of a folder with their bytes, pages without their remarks, if any: one tells how long compiling took."""
     files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-    remarks = rb"<details><summary>Remarks.*?</details>"
+    remarks = rb"\s*<details><summary>Remarks.*?</details>"
     return {name: re.sub(remarks, b"", bytes_) if name == "report.html" else bytes_ for name, bytes_ in files.items()}
 
 

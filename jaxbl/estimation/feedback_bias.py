@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxbl.chain import Experiment
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 from jaxbl.records import Record
 
 from .regression import balance
@@ -30,7 +31,7 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
     shift is (Z'X)^-1 Z'r; its covariance is that of sums over blocks. Reference: J. A. Hausman, Econometrica 46 (1978).
 
     Returns:
-        By side `inertia` and `viscous`, each with `shift`, `standard_error`, `unit`; `probability` of a shift as large by
+        By side the shifts `inertia` and `viscous` (:class:`~jaxbl.Quantity`); `probability` of a shift as large by
         chance; whether it is `biased`; and a `sentence`. Empty for a log without a reference.
     """
     if record.reference is None:
@@ -58,14 +59,15 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
         # of two numbers
         probability = float(np.exp(-0.5 * shift @ np.linalg.solve(covariance, shift)))
         numbers = {
-            name: {"shift": value, "standard_error": error, "unit": record.unit_of(f"{side}.{name}", unit)}
+            name: Quantity(value, error, unit=record.unit_of(f"{side}.{name}", unit))
             for name, unit, value, error in zip(
                 ("inertia", "viscous"), ("kg m²", "N m s/rad"), shift, np.sqrt(np.diag(covariance)), strict=True
             )
         }
         biased = probability < _SIGNIFICANT
         verdict = "numbers are biased by feedback, or an effect is missing" if biased else "no bias by feedback is seen"
-        sizes = ", ".join(f"{n} {q['shift']:+.2g} ± {q['standard_error']:.2g} {q['unit']}" for n, q in numbers.items())
+        sizes = ", ".join(f"{name} {shift}" for name, shift in numbers.items())
         sentence = f"{side}: {verdict}; with the reference as instrument: {sizes} (p = {probability:.2g})."
-        bias_by_side[side] = numbers | {"probability": probability, "biased": biased, "sentence": sentence}
+        entries = {name: shift.to_dict() for name, shift in numbers.items()}
+        bias_by_side[side] = entries | {"probability": probability, "biased": biased, "sentence": sentence}
     return bias_by_side

@@ -72,8 +72,8 @@ def test_bias_is_found_where_the_disturbance_is(tmp_path, disturbance):
         ("inertia", "viscous"), (drive.motor_inertia, drive.motor_viscous), (INERTIA, VISCOUS), by_instruments, strict=True
     ):
         error = found[key]["standard_error"]
-        assert abs(number + found[key]["shift"] - true) < 3.0 * error
-        assert number + found[key]["shift"] == pytest.approx(other, abs=0.7 * error + 0.02 * true)
+        assert abs(number + found[key]["value"] - true) < 3.0 * error
+        assert number + found[key]["value"] == pytest.approx(other, abs=0.7 * error + 0.02 * true)
     if disturbance:
         assert abs(drive.motor_inertia - INERTIA) > 5.0 * found["inertia"]["standard_error"]
 
