@@ -31,7 +31,7 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
     shift is (Z'X)^-1 Z'r; its covariance is that of sums over blocks. Reference: J. A. Hausman, Econometrica 46 (1978).
 
     Returns:
-        By side the shifts `inertia` and `viscous` (:class:`~jaxbl.Quantity`); `probability` of a shift as large by
+        By side the shifts `inertia` and `viscous` (:class:`jaxbl.quantity.Quantity`); `probability` of a shift as large by
         chance; whether it is `biased`; and a `sentence`. Empty for a log without a reference.
     """
     if record.reference is None:
