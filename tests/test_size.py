@@ -16,12 +16,12 @@ from size import ROOT, Size, measure_file, measure_folders
 # `observer` by numbers that survive a standstill, `estimation` by rigs with play and slip and the test for bias by
 # feedback. `report` pays for all.
 CEILINGS = {
-    "all": (400016, 0.02, 0.2, 0.0),
-    "report": (51863, 0.05, 0.78, 0.0),
+    "all": (400037, 0.02, 0.2, 0.0),
+    "report": (51825, 0.05, 0.78, 0.0),
     "diagnosis": (59514, 0.0, 0.0, 0.0),
     "records": (51691, 0.0, 0.0, 0.0),
     "gains": (39034, 0.0, 0.0, 0.0),
-    "estimation": (34240, 0.0, 0.0, 0.0),
+    "estimation": (34243, 0.0, 0.0, 0.0),
     "sweeps": (30249, 0.08, 0.0, 0.0),
     "exports": (24343, 0.02, 0.0, 0.0),
     "fused": (24286, 0.0, 0.0, 0.0),
@@ -29,7 +29,7 @@ CEILINGS = {
     "drive": (13099, 0.0, 1.6, 0.0),
     "throughput": (10661, 0.0, 0.0, 0.0),
     "cli": (9738, 0.09, 0.0, 0.0),
-    "config": (10421, 0.0, 0.0, 0.0),
+    "config": (10477, 0.0, 0.0, 0.0),
     "observer": (9184, 0.0, 0.0, 0.0),
     "monitoring": (5877, 0.0, 0.0, 0.0),
     "control": (2496, 0.0, 0.0, 0.0),

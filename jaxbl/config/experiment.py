@@ -42,10 +42,8 @@ class _FileTable(Table):
 
     def _load_columns(self) -> tuple[np.ndarray, np.ndarray]:
         """Load times from the first one on, s, and the signal, shape (rows,). Raises `InputError`."""
-        path, column = (
-            Path(self.file),
-            next(value for name, value in self if name.endswith("_column") and name != "time_column"),
-        )
+        path = Path(self.file)
+        (column,) = (value for name, value in self if name.endswith("_column") and name != "time_column")
         file = read_log_file(path, (self.time_column, column))
         times = file.load_numbers(self.time_column)
         file.check_length(file.find_column(column), len(times))

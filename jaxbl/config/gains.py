@@ -192,6 +192,10 @@ class TuneTable(Table):
             if getattr(self, name) != field.get_default(call_default_factory=True)
         ]
         in_loop = self.objective in LOOP_OBJECTIVES
+        paths = [gain.path for gain in self.gains]
+        for i, path in enumerate(paths):
+            if path in paths[:i]:
+                raise table_error(f"gains[{i}].path: '{path}' is listed already; each gain may be listed once")
         for key in ("gains", "longest_settling", "largest_limit_cycle"):
             if key in changed and not in_loop:
                 raise table_error(f"{key} needs an objective of the loop: {', '.join(LOOP_OBJECTIVES)}")

@@ -194,6 +194,8 @@ def _check_sides(config: Config) -> None:
             raise table_error(f"{name}.{side} is missing: a {kind} drive has a {side} observer; give its lambda and alpha")
     if rigid and config.controller is not None and config.controller.side == "load":
         raise table_error(f"controller.side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
+    if rigid and getattr(config.controller, "gap_from", None) == "twist":
+        raise table_error(f"controller.gap_from: a {kind} drive has no twist; it should be 'reference'")
     certificate = None if config.tune is None else config.tune.certificate
     if rigid and certificate is not None and certificate.load is not None:
         raise table_error(f"tune.certificate.load has no meaning on a {kind} drive; remove it")

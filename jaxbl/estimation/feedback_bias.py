@@ -32,12 +32,12 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
 
     Returns:
         By side the shifts `inertia` and `viscous` (:class:`jaxbl.quantity.Quantity`); `probability` of a shift as large by
-        chance; whether it is `biased`; and a `sentence`. Empty for a log without a reference.
+        chance; whether it is `biased`; and a `sentence`. Empty for a log without a reference, or in pieces of a few samples.
     """
-    if record.reference is None:
+    parts = [segment for segment in segments if len(segment) > 4 * _EDGE]
+    if record.reference is None or not parts:
         return {}
     period, bias_by_side = record.sample_period, {}
-    parts = [segment for segment in segments if len(segment) > 4 * _EDGE]
     velocities = [np.gradient(record.reference[part.rows], period) for part in parts]
     inside = slice(_EDGE, -_EDGE)
     instruments = np.concatenate([np.stack([np.gradient(v, period), v], 1)[inside] for v in velocities])

@@ -57,7 +57,7 @@ def _list_remedies(run: JsonObject, level: str) -> dict[str, JsonObject]:
     return remedies
 
 
-def _set_keys(tables: JsonObject, values: JsonObject) -> JsonObject:
+def set_keys(tables: JsonObject, values: JsonObject) -> JsonObject:
     """Set dotted keys in a copy of a config's tables; None removes a key."""
     data = copy.deepcopy(tables)
     for path, value in values.items():
@@ -86,7 +86,7 @@ def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stage
     for number, (_, group) in enumerate(groups):
         name = f"{level}-{side}-{number}"
         structural_values = {path: group[path].iloc[0] for path in structural}
-        remedies = _list_remedies(_set_keys(study.to_dict(), structural_values)["run"], level)
+        remedies = _list_remedies(set_keys(study.to_dict(), structural_values)["run"], level)
         all_remedies = {path: value for remedy in remedies.values() for path, value in remedy.items()}
         helps = {}
         for cause, remedy in remedies.items():
@@ -114,8 +114,8 @@ def repeat_runs(
     study: Config, rows: pd.DataFrame, structural_values: JsonObject, change: JsonObject, stages: Stages, name: str
 ) -> pd.DataFrame | None:
     """Repeat runs with changed keys, as a study of listed points. Returns None if the change has no effect."""
-    unchanged = _set_keys(study.to_dict(), structural_values)
-    data = _set_keys(unchanged, change)
+    unchanged = set_keys(study.to_dict(), structural_values)
+    data = set_keys(unchanged, change)
     paths = [axis.path for axis in study.axes if axis.path not in structural_values and axis.path not in change]
     removed_axes = [axis.path for axis in study.axes if axis.path in change and axis.path not in structural_values]
     before, after = (read_config({**tables, "axes": []}).to_dict() for tables in (unchanged, data))

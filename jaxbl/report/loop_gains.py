@@ -8,6 +8,7 @@ from pathlib import Path
 import tomli_w
 
 from jaxbl.files import write_json
+from jaxbl.gains.counterexamples import set_keys
 from jaxbl.gains.loop_gains import LoopTuning
 from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -36,18 +37,12 @@ def draw_loop_tuning(tuning: LoopTuning) -> list[Figure]:
 
 def write_loop_tuning(tuning: LoopTuning, folder: Path) -> str:
     """Write `gains.toml` and `tuning.json`. Returns the study's TOML."""
-    summary, data = tuning.summary, {}
-    for path, gain in summary["gains"].items():
-        *names, key = path.split(".")
-        table = data
-        for name in names:
-            table = table.setdefault(name, {})
-        table[key] = gain
+    summary = tuning.summary
     head = (
         f"# Gains of a loop chosen by 'jaxbl tune'{for_title(summary)}\n# Objective: {summary['objective_metric']}.\n"
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n'
     )
-    (folder / "gains.toml").write_text(head + tomli_w.dumps(data), encoding="utf-8")
+    (folder / "gains.toml").write_text(head + tomli_w.dumps(set_keys({}, summary["gains"])), encoding="utf-8")
     write_json(folder / "tuning.json", summary, allow_nan=False)
     return tuning.config.to_toml()
 

@@ -270,12 +270,19 @@ def test_bad_tables_are_told_in_one_line(change, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_load_loop_needs_a_load():
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({}, "side: 'load' has no meaning on a rigid drive"),
+        ({"side": "motor", "gap_from": "twist"}, "gap_from: a rigid drive"),
+    ],
+)
+def test_a_load_loop_needs_a_load(keys, message):
     study = {
         "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_viscous": 0.1},
         "observer": {"motor": {"lambda": 10.0, "alpha": 100.0}},
-        "controller": STUDY["controller"],
+        "controller": STUDY["controller"] | keys,
         "reference": STUDY["reference"],
     }
-    with pytest.raises(jaxbl.InputError, match=r"controller\.side: 'load' has no meaning on a rigid drive"):
+    with pytest.raises(jaxbl.InputError, match=rf"controller\.{message}"):
         jaxbl.read_config(study)

@@ -1,5 +1,7 @@
 """Bias by feedback: logs of a simulated loop with a disturbance that u does not have, beside instruments in NumPy."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 import jaxbl
 from jaxbl.control import Cascade, FunctionReference
+from jaxbl.estimation.feedback_bias import find_feedback_bias
 
 INERTIA, VISCOUS, STEPS = 0.05, 0.15, 20_000
 MODEL = {
@@ -96,3 +99,8 @@ def test_a_reference_at_rest_tests_nothing(tmp_path):
 def test_without_a_reference_nothing_is_said(tmp_path):
     log = simulate_log(tmp_path / "log.csv", 0.0)
     assert jaxbl.identify(log, MODEL | {"log": {}}).summary["feedback"] == {}
+
+
+def test_pieces_of_a_few_samples_test_nothing():
+    record, pieces = SimpleNamespace(reference=np.zeros(60)), [np.zeros(30), np.zeros(30)]
+    assert find_feedback_bias(record, pieces, None) == {}

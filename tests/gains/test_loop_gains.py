@@ -180,6 +180,7 @@ BAD = {
         {},
         "tune.gains: controller.inertia_feedforward is 0 in the study; give its start and stop in [[tune.gains]]",
     ),
+    "twice": ({"gains": [{"path": POSITION}, {"path": POSITION}]}, {}, f"gains[1].path: '{POSITION}' is listed already"),
     "range": ({"gains": [{"path": POSITION, "start": 2.0, "stop": 1.0}]}, {}, "start 2.0 should be less than stop 1.0"),
     "objective": ({"objective": "velocity"}, {}, "tune: gains needs an objective of the loop: following, settling"),
     "observers": ({"observers": ["luenberger"]}, {}, "observers does not go with objective = 'following'"),
