@@ -68,7 +68,7 @@ def run_batch(
     count = len(jobs)
     rows = []
     processes = useful_processes(count) if processes is None else min(processes, count)
-    with open_results(out, Subject("batch")) as results, connect(scheduler) as cluster:
+    with open_results(out, Subject("batch"), overwrite=jobs[0].overwrite) as results, connect(scheduler) as cluster:
         # the folder is a batch's before there are folders of logs in it
         results.write_manifest()
         progress(0, count)

@@ -4,9 +4,11 @@ import math
 from pathlib import Path
 
 import pandas as pd
+import pytest
 
 from jaxbl import batch
 from jaxbl.batch import format_batch, make_batch_row, read_batch, run_batch
+from jaxbl.errors import InputError
 
 DIAGNOSIS = {
     "verdict": "explained",
@@ -86,3 +88,17 @@ def test_a_clusters_workers_diagnose(tmp_path, client, monkeypatch):
     assert [row["log"] for row in rows] == ["a.csv", "b.csv", "c.csv"]
     assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert list(pd.read_csv("out/batch.csv")["verdict"]) == ["explained"] * 3
+
+
+def test_a_damaged_manifest_is_made_anew_with_overwrite(tmp_path, monkeypatch):
+    (tmp_path / "a.csv").write_text("")
+    monkeypatch.setattr(batch, "_diagnose_log", _make_row)
+    work, _ = read_batch(tmp_path, tmp_path / "a.toml", tmp_path / "out", overwrite=False)
+    run_batch(work, tmp_path / "out", 1, lambda *done: None)
+    manifest = tmp_path / "out" / "manifest.json"
+    whole = manifest.read_bytes()
+    manifest.write_bytes(whole[:-20])
+    with pytest.raises(InputError, match=r"is damaged .* begin anew with --overwrite"):
+        run_batch(work, tmp_path / "out", 1, lambda *done: None)
+    run_batch([job._replace(overwrite=True) for job in work], tmp_path / "out", 1, lambda *done: None)
+    assert manifest.read_bytes() == whole

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from .rigid_body import smooth_sign
 from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 from .table import POSITION_CHANNELS
 from .time_stamps import SECONDS_PER_UNIT
+from .unnamed_columns import find_latest, find_moving_columns, find_stamps, rises_evenly
 
 _Table = dict[str, Any]
 """A table of a study, by key."""
@@ -28,21 +29,25 @@ _ROUGH_UNCERTAINTY = 0.5
 """Relative uncertainty of numbers from a rough fit: inertias and stiffness may be split wrongly between the sides."""
 _LARGEST_WHOLE = 100.0
 """Ratio from which on a whole number has to lie within the errors: ratios of several stages are no whole numbers."""
+_SURE_RATIO = 0.02
+"""Standard error of a large ratio up to which a whole number in its reach is no chance: one of eight ratios has one."""
 _NAME_PATTERNS = {
-    "t": r"t|time|timestamp|times|zeit|clock",
-    "u": r"u|torque|tau|moment|drehmoment|force|kraft|current|strom|iq|i_q|voltage|volt|vir|vm|effort",
-    "load": r"(theta_s|load|output|arm|joint|link|secondary|enc(oder)?_?2)",
-    "motor": r"motor",
-    "omega": r"(omega|speed|velocity|velo|drehzahl|geschwindigkeit|rpm|vel)",
-    "position": r"(theta|theta_[es]|position|pos|angle|winkel|lage|enc|encoder|q|qm|enc(oder)?_?[12])",
-    "setpoint": r"(goal|target|set|ref|command|cmd|desired|soll|demand)",
+    "t": r"ts?|clock|date|millis|micros|.*(time|zeit|stamp|elapsed).*",
+    "u": r"(u|i|i_?q|q_current|tau|trq|curr?|vm|vir)\d*|.*(torque|moment|force|kraft|effort|current|strom|volt).*",
+    "load": r"s|l|out|arm|link|secondary|enc(oder)?_?2|.*(load|last|output|abtrieb|joint|gelenk).*",
+    "motor": r".*motor.*",
+    "omega": r"(vel|velo|spd|rpm|dq|qd)\d*|.*(omega|speed|velocit|drehzahl|geschwindigkeit).*",
+    "position": r"(pos|ang|phi|q|qm|enc)\d*|.*(theta|positi|angle|winkel|lage|encod).*",
+    "setpoint": r"goal|set|ref|cmd|.*(target|command|desired|soll|demand|setpoint|reference).*",
+    "supply": r".*volt.*",
 }
-"""Kind of a column -> its usual names."""
+"""Kind of a column -> its usual words, or joined words."""
 _SPELLINGS = {
-    "rad": "rad", "deg": "deg|°|degrees", "turn": "turn|rev", "m": "m", "mm": "mm", "counts": "counts|inc|tick|ticks",
-    "s": "s|sec", "ms": "ms", "us": "us|µs", "ns": "ns", "N m": "nm|n m|n·m", "N": "n", "A": "a", "V": "v",
+    "rad": "rad", "deg": "deg|°|degrees", "turn": "turn|turns|rev", "m": "m", "mm": "mm",
+    "counts": "counts|count|inc|tick|ticks",
+    "s": "s|sec", "ms": "ms|millis", "us": "us|µs|micros", "ns": "ns", "N m": "nm|n m|n·m", "N": "n", "A": "a", "V": "v",
     "rpm": "rpm|1/min", "rad/s": "rad/s", "deg/s": "deg/s|°/s", "turn/s": "rev/s", "m/s": "m/s", "mm/s": "mm/s",
-    "mN m": "mnm|mn m", "%": "%", "mA": "ma",
+    "mN m": "mnm|mn m", "%": "%|percent", "mA": "ma",
 }  # fmt: skip
 _UNIT_NAMES = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split("|")}
 """Spelling of a unit -> its name in `[log]`."""
@@ -54,95 +59,113 @@ _TORQUE_UNITS = {
 """Unit of a torque -> unit and factor in `[log]`."""
 
 
+class _Candidate(NamedTuple):
+    """A column that may hold a channel; a second choice stands in for one that is missing."""
+
+    is_second_choice: bool
+    column: ColumnName
+    name: str
+    unit: str
+    values: np.ndarray
+
+
 def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
-    """Split the name of a column: in lower case without its unit, and the unit as `[log]` calls it, "" for none."""
-    name, unit = str(column).strip().lower(), str(file.units.get(column, "")).lower()
+    """Split the name of a column: words in lower case without its unit, and the unit as `[log]` calls it, "" for none."""
+    name, unit = str(column).strip(), str(file.units.get(column, "")).lower()
     if match := re.search(r"[\[(]\s*(.+?)\s*[\])]\s*$", name):
-        name = name[: match.start()]
         # what follows without a blank is a unit that is known, or the index or name of an element
-        if match[1] in _UNIT_NAMES or name.endswith(" "):
-            unit = unit or match[1]
-    name = name.strip(" _")
-    stem, underscore, end = name.rpartition("_")
-    if not unit and underscore and end in _UNIT_NAMES and end not in ("s", "m", "v", "a", "n"):
-        name, unit = stem, end
+        if match[1].lower() in _UNIT_NAMES or name[: match.start()].endswith(" "):
+            unit = unit or match[1].lower()
+        name = name[: match.start()]
+    # of single letters only these are no index, after a word or a stroke
+    if (
+        (match := re.search(r"(?:^|[_ /])([^\W_]{2,}|[°%AV]|(?<=/)\w|(?<=time_)s)$", name))
+        and not unit
+        and match[1].lower() in _UNIT_NAMES
+    ):
+        name, unit = name[: match.start()], match[1].lower()
+    words = re.split(r"[^a-z0-9äöü]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
+    # the current position is no current
+    is_idle = r"\b(present|actual|measured|current (?=(joint|motor|pos|ang|vel|speed|theta)))\s*"
+    name = re.sub(is_idle, "", " ".join(filter(None, words))).strip()
     return name, _UNIT_NAMES.get(unit, unit)
 
 
 def _matches(kind: str, name: str) -> bool:
     """Return True if a name, or a word of it, is usual for a kind of column."""
-    return any(re.fullmatch(_NAME_PATTERNS[kind], word) for word in (_join_words(name), *re.split(r"[^a-z0-9äöü]+", name)))
-
-
-def _join_words(name: str) -> str:
-    return name.replace(" ", "_")
+    return any(re.fullmatch(_NAME_PATTERNS[kind], word) for word in (name.replace(" ", "_"), *name.split()))
 
 
 def _guess_channel(name: str, unit: str) -> str:
     """Guess the channel of a column from its name and unit; "" for none."""
-    if _matches("t", name):
+    if _matches("t", name) or (not name and unit in SECONDS_PER_UNIT):
         return "t"
     side = "s" if _matches("load", name) else "e"
     # an unknown unit fits any quantity
     is_possible = {kind: unit in units or unit not in _UNIT_NAMES.values() for kind, units in
            (("u", _TORQUE_UNITS), ("omega", (*_SPEED_UNITS, "counts")), ("position", _POSITION_UNITS))}  # fmt: skip
-    is_speed, is_position = unit in _SPEED_UNITS or _matches("omega", name), _matches("position", name)
-    # current_position is no current
-    if is_possible["u"] and (
-        re.fullmatch(_NAME_PATTERNS["u"], _join_words(name)) or (_matches("u", name) and not (is_speed or is_position))
-    ):
+    if is_possible["u"] and (_matches("u", name) or (not name and unit in ("mA", "A", "N m"))):
         return "u"
-    if is_speed:
+    if unit in _SPEED_UNITS or _matches("omega", name):
         return f"omega_{side}" if is_possible["omega"] else ""
     # motor or load as the only word does not tell the quantity: a temperature is one of the motor, too
-    is_bare_side = any(re.fullmatch(_NAME_PATTERNS[kind], _join_words(name)) and not unit for kind in ("motor", "load"))
-    has_position_unit = unit in _POSITION_UNITS and (_matches("motor", name) or _matches("load", name))
-    return f"theta_{side}" if (is_position and is_possible["position"]) or is_bare_side or has_position_unit else ""
+    is_bare_side = name in ("motor", "load", "output", "arm", "joint", "link", "secondary") and not unit
+    has_position_unit = unit in _POSITION_UNITS and (not name or _matches("motor", name) or _matches("load", name))
+    is_position = _matches("position", name) and is_possible["position"]
+    return f"theta_{side}" if is_position or is_bare_side or has_position_unit else ""
+
+
+def _is_servo_load(candidate: _Candidate) -> bool:
+    return (candidate.name, candidate.unit) == ("load", "")
 
 
 def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
-    """Guess a `[log]` table from names and units of columns; it comes with a sentence on each uncertain guess.
+    """Guess a `[log]` table from names, units and values of columns; it comes with a sentence on each uncertain guess.
 
     Raises:
-        InputError: no column looks like a position or a speed.
+        InputError: no column looks like a position or a speed, or like a time.
     """
     file = read_log_file(Path(path))
-    if all(isinstance(column, int) for column in file.columns):
-        raise InputError(
-            f"{path}: --write goes by the names of columns, and the file has none; a file with [log] for --model can give "
-            "their numbers"
-        )
-    candidates: dict[str, list[tuple[bool, ColumnName, str, np.ndarray]]] = {}
+    candidates: dict[str, list[_Candidate]] = {}
     for column in file.columns:
         name, unit = _split_unit(file, column)
         channel, is_setpoint = _guess_channel(name, unit), _matches("setpoint", name)
-        if not channel:
-            continue
-        numbers = file.load_values(column)
         # a commanded torque stands for one that was not measured, a side alone for a position
-        if channel == "t" or (numbers.dtype.kind in "iuf" and (channel == "u" or not is_setpoint)):
-            is_second_choice = is_setpoint or _matches("load", name) if channel == "u" else not _matches("position", name)
-            candidates.setdefault(channel, []).append((is_second_choice, column, unit, numbers))
-    servo_loads = [candidate for candidate in candidates.get("theta_s", ()) if candidate[1:3] == ("load", "")]
-    if servo_loads and any(not candidate[0] for candidate in candidates.get("theta_e", ())):
+        is_second_choice = not _matches("position", name)
+        if channel == "u":
+            is_second_choice = is_setpoint or _matches("load", name) or _matches("supply", name)
+        values = file.load_values(column) if channel else np.zeros(0)
+        if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or not is_setpoint)):
+            candidates.setdefault(channel, []).append(_Candidate(is_second_choice, column, name, unit, values))
+    if (bare := candidates.get("theta_s")) and any(
+        not candidate.is_second_choice for candidate in candidates.get("theta_e", ())
+    ):
         # beside a named position it is how much a servo is loaded
-        candidates["u"] = servo_loads + candidates.get("u", [])
-        candidates["theta_s"] = [candidate for candidate in candidates["theta_s"] if candidate[1] != "load"]
-        candidates = {channel: columns for channel, columns in candidates.items() if columns}
-    table: _Table = {}
+        candidates["u"] = [*filter(_is_servo_load, bare), *candidates.get("u", [])]
+        candidates["theta_s"] = [candidate for candidate in bare if not _is_servo_load(candidate)]
     guesses: list[str] = []
-    for channel, columns in candidates.items():
-        _, column, unit, numbers = min(columns, key=lambda candidate: candidate[0])
+    table: _Table = {}
+    if not candidates.get("t") or not any(map(candidates.get, ("theta_e", "theta_s", "omega_e", "omega_s"))):
+        period = _add_candidates_by_values(file, candidates, guesses)
+        if period is not None:
+            table["t"] = {"period": period}
+    chosen: dict[str, _Candidate] = {}
+    # the torque is chosen to the position
+    for channel in ("t", "theta_e", "theta_s", "omega_e", "omega_s", "u"):
+        if candidates.get(channel):
+            words = {word for candidate in chosen.values() for word in candidate.name.split()}
+            chosen[channel] = _choose(candidates[channel], words)
+    for channel, (_, column, name, unit, values) in chosen.items():
         if channel == "t":
-            table["t"] = _guess_time_table(column, unit, numbers, guesses)
+            table["t"] = _guess_time_table(column, unit, values, guesses)
         elif channel == "u":
-            if _matches("setpoint", _split_unit(file, column)[0]):
+            if _matches("setpoint", name):
                 guesses.append(f"u is '{column}', the commanded torque: no column looks like a measured one.")
             table["u"] = _guess_torque_table(column, unit, guesses)
         elif channel.startswith("theta"):
-            table[channel] = _guess_position_table(column, unit, numbers, guesses)
+            table[channel] = _guess_position_table(column, unit, values, guesses)
         # a measured position is better than the integral of a speed
-        elif channel.replace("omega", "theta") not in candidates:
+        elif channel.replace("omega", "theta") not in chosen:
             table[channel] = _assume_unit(column, unit, _SPEED_UNITS, guesses)
     if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
         columns = ", ".join(map(str, file.columns))
@@ -153,6 +176,57 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     if "t" not in table:
         raise InputError(f"{path}: no column is called like a time; [log] t can name it, or give a period")
     return table, guesses
+
+
+def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candidate]], guesses: list[str]) -> float | None:
+    """Add the time, and where no name is that of a position or speed also these and a torque, by how the columns change.
+
+    Returns:
+        The period of a file without a time, s, if a speed shows it.
+    """
+    signals = {column: file.load_values(column) for column in file.columns}
+    found: dict[str, ColumnName] = {}
+    if not candidates.get("t") and (stamps := find_stamps(signals)) is not None:
+        found["t"] = stamps
+    period = None
+    if not any(map(candidates.get, ("theta_e", "theta_s", "omega_e", "omega_s"))):
+        named = {candidate.column for columns in candidates.values() for candidate in columns}
+        moving = {
+            column: values.astype(float)
+            for column, values in signals.items()
+            if values.dtype.kind in "iuf" and not rises_evenly(values) and column not in named
+            if not _matches("setpoint", _split_unit(file, column)[0]) and np.isfinite(values).all() and np.ptp(values)
+        }
+        if len({len(values) for values in moving.values()}) == 1:
+            times = (
+                signals[found["t"]] if "t" in found else (*(chosen.values for chosen in candidates.get("t", ())), None)[0]
+            )
+            step = None if times is None or times.dtype.kind not in "iuf" else float(np.median(np.diff(times)))
+            channels, period = find_moving_columns(moving, step if times is not None else None)
+            found |= {channel: column for channel, column in channels.items() if not candidates.get(channel)}
+            if times is not None:
+                period = None
+    for channel, column in found.items():
+        for others in candidates.values():
+            others[:] = [candidate for candidate in others if candidate.column != column]
+        candidates[channel] = [_Candidate(False, column, *_split_unit(file, column), signals[column])]
+        guesses.append(f"{channel} is taken to be column '{column}' by how its numbers change.")
+    if period is not None:
+        guesses.append(f"The period is taken to be {period:g} s: a speed then is the slope of the position.")
+    return period
+
+
+def _choose(candidates: list[_Candidate], words: set[str]) -> _Candidate:
+    """Choose a column that moves: by its name, by words shared with those chosen, or what follows a reference like it."""
+    moving = [candidate for candidate in candidates if candidate.values.dtype.kind not in "iuf" or np.ptp(candidate.values)]
+
+    def rank(candidate: _Candidate) -> tuple[bool, int]:
+        return candidate.is_second_choice, -len(words & {*candidate.name.split()})
+
+    ranked = sorted(moving or candidates, key=rank)
+    alike = {candidate.column: candidate for candidate in ranked if rank(candidate) == rank(ranked[0])}
+    numbers = {column: candidate.values for column, candidate in alike.items() if candidate.values.dtype.kind in "iuf"}
+    return alike[find_latest(numbers)] if len(numbers) > 1 else ranked[0]
 
 
 def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
@@ -249,14 +323,18 @@ def propose_study(
 def _inspect_or_mend(path: str | Path, table: _Table, guesses: list[str] | None) -> Inspection | None:
     """Inspect a log; None if it is refused with a remedy, which the table then has, and `guesses` say."""
     try:
-        return inspect(path, table)
+        inspection = inspect(path, table)
+        gearing, channel = inspection.record.statistics.gearing, inspection.log.position_source("theta_s")[0]
+        if guesses is None or gearing is None or gearing.ratio > 0.0 or "sign" in table.get(channel, {"sign"}):
+            return inspection
+        reason, key, value = f"{channel} counts against theta_e", "sign", "-1"
     except InputError as error:
         remedy = re.search(r": (.+)[;:] set (\w+) = (-?[\d.e+]+) in \[log\] (\w+)(?! or)", str(error))
         if guesses is None or remedy is None or remedy[2] in table.get(remedy[4], {remedy[2]}):
             raise
         reason, key, value, channel = remedy.groups()
-        table[channel][key] = int(value) if value.lstrip("-").isdecimal() else float(value)
-        guesses.append(f"{channel}.{key} = {value}: {reason}.")
+    table[channel][key] = int(value) if value.lstrip("-").isdecimal() else float(value)
+    guesses.append(f"{channel}.{key} = {value}: {reason}.")
     return None
 
 
@@ -294,7 +372,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     if known_ratio is not None:
         ratio = known_ratio
     # most ratios of one stage are whole
-    elif whole_ratio and abs(ratio - whole_ratio) < max(0.005 * ratio * (ratio < _LARGEST_WHOLE), 5.0 * float(errors[0])):
+    elif whole_ratio and abs(ratio - whole_ratio) < _tolerate_whole(ratio, float(errors[0])):
         guesses.append(f"gear_ratio is {ratio:.4g} by the log, and taken to be {whole_ratio:g}.")
         ratio = whole_ratio
     half_inertia = 0.5 * inertia
@@ -309,6 +387,13 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
         min_stiffness = 0.0
     stiffness = max(drive.load_inertia / ratio / windup, min_stiffness)
     return replace(drive, stiffness=stiffness, half_gap=0.5 * max(gearing.lost_motion, 0.0))
+
+
+def _tolerate_whole(ratio: float, error: float) -> float:
+    """Return the distance at which a ratio counts as whole; of a large one that is not known well, any could be."""
+    if ratio < _LARGEST_WHOLE:
+        return max(0.005 * ratio, 5.0 * error)
+    return 3.0 * error * (error < _SURE_RATIO)
 
 
 def _load_motion(motor: np.ndarray, load: np.ndarray, bandwidth: float, period: float) -> tuple[np.ndarray, np.ndarray]:

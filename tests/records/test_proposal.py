@@ -43,6 +43,30 @@ COLUMNS = {
     "t, position, goal_position, speed, load": {"theta_e": "position", "u": "load"},
     "t, load, pos, temperature": {"theta_e": "pos", "u": "load"},
     "t, force, velocity [counts]": {"u": "force", "omega_e": "velocity [counts]"},
+    "Time/s, Torque/Nm, MotorPosition/rad, LoadPosition/rad": {
+        "t": "Time/s",
+        "u": "Torque/Nm",
+        "theta_e": "MotorPosition/rad",
+        "theta_s": "LoadPosition/rad",
+    },
+    "Zeit, Motormoment, Rotorlage, Abtriebswinkel": {
+        "t": "Zeit",
+        "u": "Motormoment",
+        "theta_e": "Rotorlage",
+        "theta_s": "Abtriebswinkel",
+    },
+    "ms, ticks, mA": {"t": "ms", "theta_e": "ticks", "u": "mA"},
+    "t, DC Voltage [V], Torque In [Nm], Angle In [deg], Angle Out [deg]": {
+        "u": "Torque In [Nm]",
+        "theta_e": "Angle In [deg]",
+        "theta_s": "Angle Out [deg]",
+    },
+    "t, joint_1.position, joint_2.position, joint_2.effort, joint_1.effort": {
+        "theta_s": "joint_1.position",
+        "u": "joint_1.effort",
+    },
+    "t, AngleRef[deg], AngleFbk[deg], Q Current [A]": {"theta_e": "AngleFbk[deg]", "u": "Q Current [A]"},
+    "t, Goal Position, Present Position, Present Load": {"theta_e": "Present Position", "u": "Present Load"},
     "t, i_q, motor shaft [deg], output shaft [deg]": {
         "u": "i_q",
         "theta_e": "motor shaft [deg]",
@@ -102,6 +126,39 @@ def test_what_a_refusal_asks_for_is_taken(write, channel, key, value, tmp_path):
     assert study["log"][channel][key] == value
     assert sum(guess.startswith(f"{channel}.{key} = {value}: column ") for guess in guesses) == 1
     read_model(study)
+
+
+def test_columns_without_names_are_known_by_how_they_change(tmp_path):
+    """An index in front, and a load that counts against the motor."""
+    frame = simulate_log(noise=1e-4)
+    frame["theta_s"] *= -1.0
+    frame.to_csv(tmp_path / "bare.csv", header=False)
+    study, guesses, inspection = propose_study(tmp_path / "bare.csv")
+    assert {channel: keys["column"] for channel, keys in study["log"].items()} == {
+        "t": 1,
+        "u": 2,
+        "theta_e": 3,
+        "theta_s": 4,
+    }
+    assert study["log"]["theta_s"]["sign"] == -1 and study["drive"]["gear_ratio"] == 20.0
+    assert "theta_s.sign = -1: theta_s counts against theta_e." in guesses
+    assert inspection.record.sample_period == pytest.approx(1e-3)
+    read_model(study)
+
+
+def test_a_speed_beside_its_position_gives_the_period(tmp_path):
+    frame = simulate_log()
+    columns = [frame["u"], np.gradient(frame["theta_e"], frame["t"]), frame["theta_e"]]
+    np.savetxt(tmp_path / "timeless.txt", np.column_stack(columns))
+    study, guesses, _ = propose_study(tmp_path / "timeless.txt")
+    assert study["log"] == {
+        "t": {"period": pytest.approx(1e-3)}, "theta_e": {"column": 2, "unit": "rad"}, "u": {"column": 0}
+    }  # fmt: skip
+    assert any("period is taken to be 0.001 s" in guess for guess in guesses)
+    # degrees beside rad/s: no usual period
+    np.savetxt(tmp_path / "timeless.txt", np.column_stack([*columns[:2], np.degrees(columns[2])]))
+    with pytest.raises(InputError, match="no column is called like a time"):
+        propose_study(tmp_path / "timeless.txt")
 
 
 @pytest.mark.parametrize(("ratio", "expected"), [(19.97, 20.0), (99.8, 100.0), (256.9, 256.9), (143.2, 143.2)])
@@ -172,9 +229,6 @@ def test_two_encoders_with_a_clock_and_a_zero_of_their_own(tmp_path):
 
 def test_what_cannot_be_guessed_is_refused(tmp_path):
     frame = simulate_log()
-    frame.to_csv(tmp_path / "bare.csv", index=False, header=False)
-    with pytest.raises(InputError, match="--write goes by the names of columns, and the file has none"):
-        propose_study(tmp_path / "bare.csv")
     frame[["t", "u"]].to_csv(tmp_path / "short.csv", index=False)
     with pytest.raises(InputError, match="no column is called like a position or a speed: t, u;"):
         propose_study(tmp_path / "short.csv")

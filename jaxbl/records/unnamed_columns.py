@@ -1,0 +1,104 @@
+"""Tell columns of a log by how they move, where their names do not."""
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from .least_squares import residual_mean_square
+from .libraries import ColumnName
+from .rigid_body import smooth_sign
+from .signal_quality import find_bandwidth, low_pass, low_pass_motion
+
+_Signals = Mapping[ColumnName, np.ndarray]
+_SAME, _GEARED = 0.9, 0.99
+"""Correlation from which on columns show one motion, before and behind a controller, or a gear."""
+_SAME_SIZE = 0.1
+"""Relative difference in size up to which one of two alike is the other's reference; more is a gear."""
+_LATE = 1e-6
+"""Slope of the correlation of two columns at no shift, a row, from which on one is later: rounding aside."""
+_SPEED = 0.95
+"""Correlation with the velocity from which on a column is a speed."""
+_EXPLAINED = 0.7
+"""Share of a torque's mean square that acceleration, velocity and direction explain in a plain drive."""
+_ROUND = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0)
+"""Digits of usual periods; degrees beside rad/s, or rad beside rpm, give others."""
+
+
+class MotionColumns(NamedTuple):
+    """Columns by channel, and the period in s by which the speed is the slope of the position; None if there is none."""
+
+    channels: dict[str, ColumnName]
+    period: float | None
+
+
+def rises_evenly(values: np.ndarray) -> bool:
+    """Return True for numbers that rise from row to row by about as much, as stamps and row numbers do."""
+    steps = np.diff(values) if values.dtype.kind in "iuf" else np.zeros(0)
+    return len(steps) > 0 and bool((steps > 0.0).all() and np.ptp(steps) < 3.0 * np.median(steps))
+
+
+def find_stamps(columns: _Signals) -> ColumnName | None:
+    """Find the first column that rises evenly, or holds dates or times; one that only counts rows is none."""
+    for column, values in columns.items():
+        is_date = values.dtype.kind == "M" or (values.dtype.kind == "O" and re.match(r".*\d[:-]\d", str(values[0])))
+        if is_date or (rises_evenly(values) and not (np.diff(values) == 1.0).all()):
+            return column
+    return None
+
+
+def find_latest(signals: _Signals) -> ColumnName:
+    """Return the latest column of the same motion as the first one: a reference leads what follows it."""
+    from scipy.signal import correlate
+
+    latest, *others = signals
+    for column in others:
+        before, after = (signals[name] - np.mean(signals[name]) for name in (latest, column))
+        size = float(np.linalg.norm(before) * np.linalg.norm(after)) or np.inf
+        is_same = abs(np.std(after) - np.std(before)) < _SAME_SIZE * np.std(before)
+        if is_same and correlate(before, after).max() > _SAME * size and before @ np.gradient(after) > _LATE * size:
+            latest = column
+    return latest
+
+
+def find_moving_columns(signals: _Signals, period: float | None) -> MotionColumns:
+    """Guess positions and torque of a drive; the position is the smoothest column, the motor's side moves further.
+
+    Args:
+        signals: finite columns that move, shape (rows,) each.
+        period: of the rows, s; None if it is not known.
+    """
+    names = [*signals]
+    moves = np.stack([signals[name] - np.mean(signals[name]) for name in names])
+    size = np.std(moves, axis=1)
+    first = int(np.argmin(np.std(np.diff(moves), axis=1) / size))
+    likeness = moves @ moves[first] / (moves.shape[1] * size * size[first])
+    is_same = (likeness > _SAME) & (np.abs(size / size[first] - 1.0) < _SAME_SIZE)
+    position = find_latest({names[i]: signals[names[i]] for i in np.flatnonzero(is_same)})
+    sides = [(size[first], position)]
+    others = np.where(is_same, 0.0, np.abs(likeness))
+    if others.max() > _GEARED:
+        sides.append((size[others.argmax()], names[others.argmax()]))
+    channels: dict[str, ColumnName] = {"theta_e": position}
+    others = np.where(is_same, 0.0, np.abs(likeness))
+    if others.max() > _GEARED:
+        motor, load = sorted((position, names[others.argmax()]), key=lambda name: -np.std(signals[name]))
+        channels = {"theta_e": motor, "theta_s": load}
+    cutoff = 4.0 * find_bandwidth(signals[position], period or 1.0, differentiate=True) or np.inf
+    _, velocity, acceleration = low_pass_motion(signals[position], cutoff, period or 1.0)
+    rows = np.column_stack([acceleration, velocity, smooth_sign(velocity), np.ones(len(velocity))])
+    shares: dict[float, ColumnName] = {}
+    for i in np.flatnonzero(~is_same & (others <= _GEARED)):
+        smooth = low_pass(moves[i], cutoff, period or 1.0)
+        if abs(np.corrcoef(smooth, velocity)[0, 1]) > _SPEED:
+            ratio = float(np.std(velocity) / np.std(smooth))
+            digits = ratio / 10.0 ** np.floor(np.log10(ratio))
+            usual = min(_ROUND, key=lambda number: abs(number - digits))
+            if period is None and abs(digits / usual - 1.0) < 0.01:
+                return find_moving_columns(signals, ratio / digits * usual)
+        else:
+            shares[1.0 - residual_mean_square(smooth, rows) / float(np.var(smooth))] = names[i]
+    if shares and max(shares) > _EXPLAINED:
+        channels["u"] = shares[max(shares)]
+    return MotionColumns(channels, period)
