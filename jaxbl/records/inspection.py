@@ -316,26 +316,31 @@ def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str
 
 def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> tuple[_Answer, str]:
     """Judge the stiffness by twist over torque within one direction of motion; `noise` is that of the twist, rms."""
-    torque = record.transmitted
-    if torque is None:
-        if record.torque is None or np.ptp(record.torque) == 0.0:
-            return "no", "no varying torque was recorded"
-        torque = record.torque
-    twist = record.positions["motor"] - ratio * record.positions["load"]
-    width = record.statistics.channels["theta_e"].bandwidth
-    if width == 0.0:
+    if record.transmitted is None and (record.torque is None or np.ptp(record.torque) == 0.0):
+        return "no", "no varying torque was recorded"
+    if record.statistics.channels["theta_e"].bandwidth == 0.0:
         return "no", "the motion does not exceed the noise"
-    targets, rows = [], []
-    for s in record.segments:
-        signals = np.stack([twist[s], torque[s], np.sign(speed[s]), speed[s]], axis=1)
-        smooth = low_pass(signals, 4.0 * width, record.sample_period)
-        targets.append(smooth[:, 0])
-        rows.append(np.column_stack([smooth[:, 1:], np.ones(len(smooth))]))
-    coefficients, errors = fit_with_jackknife(np.concatenate(targets), np.concatenate(rows))
-    if not np.isfinite(coefficients[0]):
+    slope, error, spread = fit_twist(record, speed, ratio)
+    if not np.isfinite(slope):
         return "weak", "the log is too short to see how the twist follows the torque"
-    windup = abs(float(coefficients[0])) * float(np.std(torque))
+    windup = abs(slope) * spread
     unit = record.statistics.channels["theta_e"].unit
-    if coefficients[0] < 5.0 * errors[0] or windup < noise:
+    if slope < 5.0 * error or windup < noise:
         return "weak", f"the twist hardly follows the torque (it winds up {windup:.2g} {unit} rms)"
     return "yes", f"the twist follows the torque: {windup:.2g} {unit} rms against a noise of {noise:.2g}"
+
+
+def fit_twist(record: Record, speed: np.ndarray, ratio: float) -> tuple[float, float, float]:
+    """Fit the twist at the motor to the measured torque, direction and speed.
+
+    Returns:
+        Twist a torque, rad / N m (m / N), its standard error, and the rms of the torque about its mean.
+    """
+    torque = record.torque if record.transmitted is None else record.transmitted
+    assert torque is not None
+    twist = record.positions["motor"] - ratio * record.positions["load"]
+    cutoff = 4.0 * record.statistics.channels["theta_e"].bandwidth or math.inf
+    signals = np.stack([twist, torque, np.sign(speed), speed, np.ones(len(twist))], axis=1)
+    smooth = np.concatenate([low_pass(signals[segment], cutoff, record.sample_period) for segment in record.segments])
+    slopes, errors = fit_with_jackknife(smooth[:, 0], smooth[:, 1:])
+    return float(slopes[0]), float(errors[0]), float(np.std(torque))

@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,11 +13,8 @@ from jaxbl.errors import InputError
 from .alignment import NominalDrive
 from .channels import POSITION_FACTORS, SPEED_FACTORS
 from .files import LogFile, read_log_file
-from .inspection import Inspection, inspect
-from .least_squares import fit_with_jackknife
+from .inspection import Inspection, compute_velocity, fit_twist, inspect
 from .libraries import ColumnName
-from .rigid_body import smooth_sign
-from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 from .table import POSITION_CHANNELS
 from .time_stamps import SECONDS_PER_UNIT
 from .unnamed_columns import find_latest, find_moving_columns, find_stamps, rises_evenly
@@ -51,12 +47,14 @@ _SPELLINGS = {
 }  # fmt: skip
 _UNIT_NAMES = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split("|")}
 """Spelling of a unit -> its name in `[log]`."""
-_SPEED_UNITS, _POSITION_UNITS = [*SPEED_FACTORS], [*POSITION_FACTORS]
-_TORQUE_UNITS = {
-    "N m": ("N m", None), "N": ("N", None), "A": ("A", 1.0), "V": ("V", 1.0), "counts": ("counts", 1.0),
-    "mN m": ("N m", 1e-3), "%": ("N m", 0.01), "mA": ("A", 1e-3),
+_CHANNEL_UNITS: dict[str, dict[str, _Table]] = {
+    "theta": {unit: {"unit": unit} for unit in POSITION_FACTORS} | {"counts": {"unit": "counts", "counts_per_turn": 4096.0}},
+    "omega": {unit: {"unit": unit} for unit in SPEED_FACTORS},
+    "u": {"N m": {"unit": "N m"}, "mN m": {"unit": "N m", "factor": 1e-3}, "N": {"unit": "N"},
+          "%": {"unit": "N m", "factor": 0.01}, "mA": {"unit": "A", "factor": 1e-3}}
+    | {unit: {"unit": unit, "factor": 1.0} for unit in ("A", "V", "counts")},
 }  # fmt: skip
-"""Unit of a torque -> unit and factor in `[log]`."""
+"""Kind of a channel -> unit of its column -> keys of `[log]`; the first unit is assumed where there is none."""
 
 
 class _Candidate(NamedTuple):
@@ -98,25 +96,20 @@ def _matches(kind: str, name: str) -> bool:
 
 def _guess_channel(name: str, unit: str) -> str:
     """Guess the channel of a column from its name and unit; "" for none."""
+    side = "s" if _matches("load", name) else "e"
     if _matches("t", name) or (not name and unit in SECONDS_PER_UNIT):
         return "t"
-    side = "s" if _matches("load", name) else "e"
     # an unknown unit fits any quantity
-    is_possible = {kind: unit in units or unit not in _UNIT_NAMES.values() for kind, units in
-           (("u", _TORQUE_UNITS), ("omega", (*_SPEED_UNITS, "counts")), ("position", _POSITION_UNITS))}  # fmt: skip
-    if is_possible["u"] and (_matches("u", name) or (not name and unit in ("mA", "A", "N m"))):
+    fitting = [kind for kind, units in _CHANNEL_UNITS.items() if unit in units or unit not in _SPELLINGS]
+    if "u" in fitting and (_matches("u", name) or (not name and unit in ("mA", "A", "N m"))):
         return "u"
-    if unit in _SPEED_UNITS or _matches("omega", name):
-        return f"omega_{side}" if is_possible["omega"] else ""
+    if _matches("omega", name) or unit in SPEED_FACTORS:
+        return f"omega_{side}" if "omega" in fitting or unit == "counts" else ""
     # motor or load as the only word does not tell the quantity: a temperature is one of the motor, too
     is_bare_side = name in ("motor", "load", "output", "arm", "joint", "link", "secondary") and not unit
-    has_position_unit = unit in _POSITION_UNITS and (not name or _matches("motor", name) or _matches("load", name))
-    is_position = _matches("position", name) and is_possible["position"]
+    has_position_unit = unit in POSITION_FACTORS and (not name or _matches("motor", name) or side == "s")
+    is_position = _matches("position", name) and "theta" in fitting
     return f"theta_{side}" if is_position or is_bare_side or has_position_unit else ""
-
-
-def _is_servo_load(candidate: _Candidate) -> bool:
-    return (candidate.name, candidate.unit) == ("load", "")
 
 
 def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
@@ -137,37 +130,25 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         values = file.load_values(column) if channel else np.zeros(0)
         if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or not is_setpoint)):
             candidates.setdefault(channel, []).append(_Candidate(is_second_choice, column, name, unit, values))
-    if (bare := candidates.get("theta_s")) and any(
-        not candidate.is_second_choice for candidate in candidates.get("theta_e", ())
-    ):
-        # beside a named position it is how much a servo is loaded
-        candidates["u"] = [*filter(_is_servo_load, bare), *candidates.get("u", [])]
-        candidates["theta_s"] = [candidate for candidate in bare if not _is_servo_load(candidate)]
     guesses: list[str] = []
     table: _Table = {}
-    if not candidates.get("t") or not any(map(candidates.get, ("theta_e", "theta_s", "omega_e", "omega_s"))):
-        period = _add_candidates_by_values(file, candidates, guesses)
-        if period is not None:
-            table["t"] = {"period": period}
+    if not candidates.get("t") or not _POSITIONS & {*candidates}:
+        table |= _add_candidates_by_values(file, candidates, guesses)
     chosen: dict[str, _Candidate] = {}
     # the torque is chosen to the position
-    for channel in ("t", "theta_e", "theta_s", "omega_e", "omega_s", "u"):
-        if candidates.get(channel):
-            words = {word for candidate in chosen.values() for word in candidate.name.split()}
-            chosen[channel] = _choose(candidates[channel], words)
-    for channel, (_, column, name, unit, values) in chosen.items():
-        if channel == "t":
-            table["t"] = _guess_time_table(column, unit, values, guesses)
-        elif channel == "u":
-            if _matches("setpoint", name):
-                guesses.append(f"u is '{column}', the commanded torque: no column looks like a measured one.")
-            table["u"] = _guess_torque_table(column, unit, guesses)
-        elif channel.startswith("theta"):
-            table[channel] = _guess_position_table(column, unit, values, guesses)
+    for channel in sorted(candidates, key=("t", "theta_e", "theta_s", "omega_e", "omega_s", "u").index):
+        words = {word for candidate in chosen.values() for word in candidate.name.split()}
+        chosen[channel] = _choose(candidates[channel], words)
+    if "theta_e" in chosen and not chosen["theta_e"].is_second_choice and chosen.get("theta_s", ("",) * 3)[2] == "load":
+        # beside a named position it is how much a servo is loaded
+        chosen["u"] = chosen.pop("theta_s")
+    for channel, candidate in chosen.items():
+        if channel == "u" and _matches("setpoint", candidate.name):
+            guesses.append(f"u is '{candidate.column}', the commanded torque: no column looks like a measured one.")
         # a measured position is better than the integral of a speed
-        elif channel.replace("omega", "theta") not in chosen:
-            table[channel] = _assume_unit(column, unit, _SPEED_UNITS, guesses)
-    if not {"theta_e", "theta_s", "omega_e", "omega_s"} & set(table):
+        if channel.replace("omega", "theta") not in {*chosen} - {channel}:
+            table[channel] = _make_table(channel, candidate, guesses)
+    if not _POSITIONS & {*table}:
         columns = ", ".join(map(str, file.columns))
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
     if "u" not in table:
@@ -178,42 +159,43 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     return table, guesses
 
 
-def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candidate]], guesses: list[str]) -> float | None:
+_POSITIONS = {"theta_e", "theta_s", "omega_e", "omega_s"}
+"""Channels of which a log has one at least."""
+
+
+def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candidate]], guesses: list[str]) -> _Table:
     """Add the time, and where no name is that of a position or speed also these and a torque, by how the columns change.
 
     Returns:
-        The period of a file without a time, s, if a speed shows it.
+        `t` with a period for a file without a time, if a speed shows it; else nothing.
     """
     signals = {column: file.load_values(column) for column in file.columns}
+    times = next((candidate.values for candidate in candidates.get("t", ())), None)
     found: dict[str, ColumnName] = {}
-    if not candidates.get("t") and (stamps := find_stamps(signals)) is not None:
-        found["t"] = stamps
-    period = None
-    if not any(map(candidates.get, ("theta_e", "theta_s", "omega_e", "omega_s"))):
+    if times is None and (stamps := find_stamps(signals)) is not None:
+        found["t"], times = stamps, signals[stamps]
+    table: _Table = {}
+    if not _POSITIONS & {*candidates}:
         named = {candidate.column for columns in candidates.values() for candidate in columns}
         moving = {
             column: values.astype(float)
             for column, values in signals.items()
-            if values.dtype.kind in "iuf" and not rises_evenly(values) and column not in named
-            if not _matches("setpoint", _split_unit(file, column)[0]) and np.isfinite(values).all() and np.ptp(values)
+            if column not in named and not _matches("setpoint", _split_unit(file, column)[0])
+            if values.dtype.kind in "iuf" and not rises_evenly(values) and np.isfinite(values).all() and np.ptp(values)
         }
-        if len({len(values) for values in moving.values()}) == 1:
-            times = (
-                signals[found["t"]] if "t" in found else (*(chosen.values for chosen in candidates.get("t", ())), None)[0]
-            )
-            step = None if times is None or times.dtype.kind not in "iuf" else float(np.median(np.diff(times)))
-            channels, period = find_moving_columns(moving, step if times is not None else None)
-            found |= {channel: column for channel, column in channels.items() if not candidates.get(channel)}
-            if times is not None:
-                period = None
+        channels, period = find_moving_columns(moving, times)
+        found |= {channel: column for channel, column in channels.items() if channel not in candidates}
+        if times is None and period is not None:
+            table["t"] = {"period": period}
+            guesses.append(f"The period is taken to be {period:g} s: a speed then is the slope of the position.")
     for channel, column in found.items():
-        for others in candidates.values():
-            others[:] = [candidate for candidate in others if candidate.column != column]
+        for other, others in [*candidates.items()]:
+            candidates[other] = [candidate for candidate in others if candidate.column != column]
+            if not candidates[other]:
+                del candidates[other]
         candidates[channel] = [_Candidate(False, column, *_split_unit(file, column), signals[column])]
         guesses.append(f"{channel} is taken to be column '{column}' by how its numbers change.")
-    if period is not None:
-        guesses.append(f"The period is taken to be {period:g} s: a speed then is the slope of the position.")
-    return period
+    return table
 
 
 def _choose(candidates: list[_Candidate], words: set[str]) -> _Candidate:
@@ -229,47 +211,36 @@ def _choose(candidates: list[_Candidate], words: set[str]) -> _Candidate:
     return alike[find_latest(numbers)] if len(numbers) > 1 else ranked[0]
 
 
-def _guess_time_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
-    if values.dtype.kind not in "iuf":
-        return {"column": column}
-    if unit not in SECONDS_PER_UNIT:
-        median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
-        # drives are sampled every 10 us to 0.1 s
-        unit = next((name for name, seconds in SECONDS_PER_UNIT.items() if median * seconds <= 0.1), "s")
-        if unit != "s":
-            guesses.append(f"t is taken to be in {unit}, by its period of {median:g}.")
-    return {"column": column, "unit": unit}
-
-
-def _guess_torque_table(column: ColumnName, unit: str, guesses: list[str]) -> _Table:
-    if unit not in _TORQUE_UNITS:
-        guesses.append(_describe_unit_guess("u", unit, "N m"))
-        return {"column": column}
-    if unit in ("A", "V", "%", "mA", "counts"):
+def _make_table(channel: str, candidate: _Candidate, guesses: list[str]) -> _Table:
+    """Make the table of a channel; `guesses` say what its unit is taken to be, and what is to be put in."""
+    _, column, _, unit, values = candidate
+    if channel == "t":
+        return {"column": column} | ({"unit": _guess_time_unit(unit, values, guesses)} if values.dtype.kind in "iuf" else {})
+    units = _CHANNEL_UNITS[channel.partition("_")[0]]
+    if channel.startswith("theta") and not unit and np.isfinite(values).all() and (values == np.round(values)).all():
+        unit = "counts"
+    keys, quantity = units.get(unit), "u" if channel == "u" else f"'{column}'"
+    if keys is None:
+        assumed = next(iter(units))
+        fault = f"'{unit}', which is unknown: put in factor; " if unit else "not given: "
+        guesses.append(f"The unit of {quantity} is {fault}{assumed} is assumed.")
+        keys = {} if channel == "u" else units[assumed]
+    elif channel == "u" and "factor" in keys and unit != "mN m":
         guesses.append(f"u.factor: put in the torque of one {unit}; 1 N m for each A or V, or for 100 %, is a placeholder.")
-    unit, factor = _TORQUE_UNITS[unit]
-    return {"column": column, "unit": unit} | ({} if factor is None else {"factor": factor})
+    elif unit == "counts":
+        guesses.append(f"{quantity} looks like counts: put in counts_per_turn; 4096 is a placeholder.")
+    return {"column": column} | keys
 
 
-def _describe_unit_guess(quantity: str, unit: str, default: str) -> str:
-    fault = f"'{unit}', which is unknown: put in factor; " if unit else "not given: "
-    return f"The unit of {quantity} is {fault}{default} is assumed."
-
-
-def _guess_position_table(column: ColumnName, unit: str, values: np.ndarray, guesses: list[str]) -> _Table:
-    is_whole = bool(np.isfinite(values).all() and (values == np.round(values)).all())
-    if unit == "counts" or (not unit and is_whole):
-        guesses.append(f"'{column}' looks like counts: put in counts_per_turn; 4096 is a placeholder.")
-        return {"column": column, "unit": "counts", "counts_per_turn": 4096.0}
-    return _assume_unit(column, unit, _POSITION_UNITS, guesses)
-
-
-def _assume_unit(column: ColumnName, unit: str, units: Sequence[str], guesses: list[str]) -> _Table:
-    """Return the table of a column, with the first one of `units` if its unit is not one of them."""
-    if unit not in units:
-        guesses.append(_describe_unit_guess(f"'{column}'", unit, units[0]))
-        unit = units[0]
-    return {"column": column, "unit": unit}
+def _guess_time_unit(unit: str, values: np.ndarray, guesses: list[str]) -> str:
+    if unit in SECONDS_PER_UNIT:
+        return unit
+    median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
+    # drives are sampled every 10 us to 0.1 s
+    unit = next((name for name, seconds in SECONDS_PER_UNIT.items() if median * seconds <= 0.1), "s")
+    if unit != "s":
+        guesses.append(f"t is taken to be in {unit}, by its period of {median:g}.")
+    return unit
 
 
 def propose_study(
@@ -354,55 +325,31 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
         viscous = viscous if viscous > 0.0 else 0.01 * dynamics.torque / max(dynamics.square**0.5, 1e-300)
     if gearing is None or inspection.gear_ratio is None or record.torque is None:
         return NominalDrive(inertia, viscous)
-    motor, load = record.positions["motor"], record.positions["load"]
-    bandwidth = record.statistics.channels["theta_e"].bandwidth
-    parts = [
-        _load_motion(motor[segment], load[segment], bandwidth, record.sample_period)
-        for segment in long_segments(record.segments)
-    ]
-    motor, rows = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
-    values, errors = fit_with_jackknife(motor, rows)
-    if not np.isfinite(values).all() or values[0] <= 0.0:
+    ratio, error = gearing.ratio, gearing.ratio_error
+    whole_ratio = float(round(ratio))
+    if ratio <= 0.0:
         channels = " or ".join(inspection.log.position_source(name)[0] for name in POSITION_CHANNELS.values())
         raise InputError(
-            f"{record.path}: theta_e moves {gearing.ratio:.4g} for each 1 of theta_s; this should be more than 0: "
+            f"{record.path}: theta_e moves {ratio:.4g} for each 1 of theta_s; this should be more than 0: "
             f"set sign = -1 in [log] {channels}, or leave one of them out, and give the file as --model"
         )
-    ratio, whole_ratio = float(values[0]), float(round(values[0]))
+    # most ratios of one stage are whole; of a large one that is not known well, any could be
+    reach = max(0.005 * ratio, 5.0 * error) if ratio < _LARGEST_WHOLE else 3.0 * error * (error < _SURE_RATIO)
     if known_ratio is not None:
         ratio = known_ratio
-    # most ratios of one stage are whole
-    elif whole_ratio and abs(ratio - whole_ratio) < _tolerate_whole(ratio, float(errors[0])):
+    elif whole_ratio and abs(ratio - whole_ratio) < reach:
         guesses.append(f"gear_ratio is {ratio:.4g} by the log, and taken to be {whole_ratio:g}.")
         ratio = whole_ratio
     half_inertia = 0.5 * inertia
     drive = NominalDrive(half_inertia, 0.5 * viscous, half_inertia * ratio**2, 0.5 * viscous * ratio**2, ratio)
     guesses.append("Inertia and friction are divided evenly between the sides, and the stiffness is a rough guess.")
-    # the load's inertia winds the shaft up by J_s / (N K) times its acceleration; where it is small, half of the torque does
-    windup = max(float(values[2]), 2.0 * float(errors[2]), 1e-300)
-    windup_twist = np.std(motor - ratio * rows[:, 0]) - 0.5 * gearing.lost_motion
-    min_stiffness = 0.5 * float(np.std(record.torque)) / max(float(windup_twist), 0.1 * gearing.lost_motion, 1e-300)
+    # half of the torque winds the shaft up
+    slope, slope_error, _ = fit_twist(record, compute_velocity(record), ratio)
+    twist = np.std(record.positions["motor"] - ratio * record.positions["load"]) - 0.5 * gearing.lost_motion
+    least = 0.5 * float(np.std(record.torque)) / max(float(twist), 0.1 * gearing.lost_motion, 1e-300)
     # False for nan, too
-    if not min_stiffness < 1e12:
-        min_stiffness = 0.0
-    stiffness = max(drive.load_inertia / ratio / windup, min_stiffness)
+    stiffness = max(0.5 / max(slope, 2.0 * slope_error, 1e-300), least if least < 1e12 else 0.0)
     return replace(drive, stiffness=stiffness, half_gap=0.5 * max(gearing.lost_motion, 0.0))
-
-
-def _tolerate_whole(ratio: float, error: float) -> float:
-    """Return the distance at which a ratio counts as whole; of a large one that is not known well, any could be."""
-    if ratio < _LARGEST_WHOLE:
-        return max(0.005 * ratio, 5.0 * error)
-    return 3.0 * error * (error < _SURE_RATIO)
-
-
-def _load_motion(motor: np.ndarray, load: np.ndarray, bandwidth: float, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return motor position, and columns of load position, velocity, acceleration, direction and 1; low-passed."""
-    cutoff = 4.0 * bandwidth or math.inf
-    position, velocity, acceleration = low_pass_motion(load, cutoff, period)
-    rows = np.column_stack([position, velocity, acceleration, smooth_sign(velocity), np.ones(len(motor))])
-    inner = trim_filter_ends(len(motor), cutoff, period) if bandwidth else slice(None)
-    return low_pass(motor, cutoff, period)[inner], rows[inner]
 
 
 def _make_study(inspection: Inspection, nominal: NominalDrive, table: _Table) -> _Table:

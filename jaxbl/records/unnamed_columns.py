@@ -62,13 +62,17 @@ def find_latest(signals: _Signals) -> ColumnName:
     return latest
 
 
-def find_moving_columns(signals: _Signals, period: float | None) -> MotionColumns:
+def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> MotionColumns:
     """Guess positions and torque of a drive; the position is the smoothest column, the motor's side moves further.
 
     Args:
         signals: finite columns that move, shape (rows,) each.
-        period: of the rows, s; None if it is not known.
+        times: of the rows, in any unit; None if they are not known.
     """
+    if len({len(values) for values in signals.values()}) != 1:
+        return MotionColumns({}, None)
+    is_timed = times is not None and times.dtype.kind in "iuf"
+    period = float(np.median(np.diff(times))) if times is not None and is_timed else 1.0
     names = [*signals]
     moves = np.stack([signals[name] - np.mean(signals[name]) for name in names])
     size = np.std(moves, axis=1)
@@ -85,20 +89,18 @@ def find_moving_columns(signals: _Signals, period: float | None) -> MotionColumn
     if others.max() > _GEARED:
         motor, load = sorted((position, names[others.argmax()]), key=lambda name: -np.std(signals[name]))
         channels = {"theta_e": motor, "theta_s": load}
-    cutoff = 4.0 * find_bandwidth(signals[position], period or 1.0, differentiate=True) or np.inf
-    _, velocity, acceleration = low_pass_motion(signals[position], cutoff, period or 1.0)
+    cutoff = 4.0 * find_bandwidth(signals[position], period, differentiate=True) or np.inf
+    _, velocity, acceleration = low_pass_motion(signals[position], cutoff, period)
     rows = np.column_stack([acceleration, velocity, smooth_sign(velocity), np.ones(len(velocity))])
-    shares: dict[float, ColumnName] = {}
+    shares, found_period = dict[float, ColumnName](), None
     for i in np.flatnonzero(~is_same & (others <= _GEARED)):
-        smooth = low_pass(moves[i], cutoff, period or 1.0)
-        if abs(np.corrcoef(smooth, velocity)[0, 1]) > _SPEED:
-            ratio = float(np.std(velocity) / np.std(smooth))
-            digits = ratio / 10.0 ** np.floor(np.log10(ratio))
-            usual = min(_ROUND, key=lambda number: abs(number - digits))
-            if period is None and abs(digits / usual - 1.0) < 0.01:
-                return find_moving_columns(signals, ratio / digits * usual)
-        else:
+        smooth = low_pass(moves[i], cutoff, period)
+        if abs(np.corrcoef(smooth, velocity)[0, 1]) < _SPEED:
             shares[1.0 - residual_mean_square(smooth, rows) / float(np.var(smooth))] = names[i]
+        elif times is None:
+            ratio = float(np.std(velocity) / np.std(smooth))
+            decade = 10.0 ** np.floor(np.log10(ratio))
+            found_period = next((decade * digits for digits in _ROUND if abs(ratio / decade / digits - 1.0) < 0.01), None)
     if shares and max(shares) > _EXPLAINED:
         channels["u"] = shares[max(shares)]
-    return MotionColumns(channels, period)
+    return MotionColumns(channels, found_period)

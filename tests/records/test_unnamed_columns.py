@@ -32,8 +32,10 @@ def test_a_position_is_smoother_than_its_torque(resolution):
     frame = simulate_log(resolution=resolution, noise=1e-5)
     drift = np.cumsum(np.random.default_rng(0).standard_normal(len(frame)))
     signals = {"temperature": drift, "torque": frame["u"], "load": frame["theta_s"], "motor": frame["theta_e"]}
-    channels, period = find_moving_columns({name: np.asarray(values) for name, values in signals.items()}, PERIOD)
-    assert channels == {"theta_e": "motor", "theta_s": "load", "u": "torque"} and period == PERIOD
+    channels, period = find_moving_columns(
+        {name: np.asarray(values) for name, values in signals.items()}, np.asarray(frame["t"])
+    )
+    assert channels == {"theta_e": "motor", "theta_s": "load", "u": "torque"} and period is None
     del signals["torque"]
-    channels, _ = find_moving_columns({name: np.asarray(values) for name, values in signals.items()}, PERIOD)
+    channels, _ = find_moving_columns({name: np.asarray(values) for name, values in signals.items()}, np.asarray(frame["t"]))
     assert "u" not in channels
