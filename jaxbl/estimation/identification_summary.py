@@ -13,8 +13,8 @@ from jaxbl.drive.parameters import leaf_paths, set_leaves
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
 from jaxbl.records import Record
+from jaxbl.records.least_squares import rms
 
-from .compilation import jit
 from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
 from .logs import LogTask, decimation
@@ -42,10 +42,10 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     segments = segments_of(record, nominal.sides, at_rest)
     noise = reading_noise(segments)
     windows, _ = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
-    left = [jit(projected_residual)(model, windows)[0] for model in rebased]
+    left = [projected_residual(model, windows)[0] for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
-        before, after = (noise[side] * float(jnp.sqrt(jnp.mean(residual[:, :, i] ** 2))) for residual in left)
+        before, after = (noise[side] * rms(residual[:, :, i]) for residual in left)
         position[side] = describe_position(record, side, noise[side], rms=after, nominal_rms=before)
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
@@ -71,7 +71,7 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
         names = {path.rpartition(".")[2] for path in leaf_paths(model) if path.startswith("transmission.")}
         return {name: value for name, value in model.transmission.truth().items() if name not in names}
 
-    values, slopes = compute_others(search_fit.fit.theta), jax.jacfwd(compute_others)(search_fit.fit.theta)
+    values, slopes = (of(jnp.asarray(search_fit.fit.theta)) for of in (compute_others, jax.jacfwd(compute_others)))
     derived = {}
     for name, value in values.items():
         number, error = float(value), float(jnp.sqrt(slopes[name] @ search_fit.spread.covariance @ slopes[name]))
@@ -156,9 +156,7 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
         }
     parameters |= _derive_numbers(fitted, search_fit)
     residual = {
-        side: describe_position(
-            record, side, noise[side], rms=noise[side] * float(jnp.sqrt(jnp.mean(search_fit.fit.residual[:, :, i] ** 2)))
-        )
+        side: describe_position(record, side, noise[side], rms=noise[side] * rms(search_fit.fit.residual[:, :, i]))
         for i, side in enumerate(side for side in fitted.sides if side in noise)
     }
     return {

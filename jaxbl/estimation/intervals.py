@@ -16,7 +16,7 @@ from scipy.special import chdtri, ndtri
 from jaxbl.chain import Experiment
 
 from .free_parameters import FreeParameter
-from .trajectory import Fit, Windows, fits
+from .trajectory import Fit, Windows, fit
 
 _Points = list[tuple[float, float]]
 """Steps of theta from the best value, and the deviance there."""
@@ -186,7 +186,10 @@ def profile(
     for _ in range(_PASSES):
         steps = np.minimum(steps, _FURTHEST)
         thetas = centre[None, :] + (sign * steps)[:, None] * directions
-        tries = fits(experiment, free, windows, thetas, _MOST_STEPS, np.eye(count, dtype=bool)[places])
+        held = np.eye(count, dtype=bool)[places]
+        tries = [
+            fit(experiment, free, windows, theta, _MOST_STEPS, still) for theta, still in zip(thetas, held, strict=True)
+        ]
         cost, ends = np.array([end.cost for end in tries]), np.array([end.theta for end in tries])
         deviance = 2.0 * (cost - float(best.cost)) / worth[places]
         for i, value in enumerate(deviance):

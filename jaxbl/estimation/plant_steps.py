@@ -6,22 +6,17 @@ than a tenth of their standard errors, what finer steps add to the positions is 
 Reference: H. Stetter, The defect correction principle and discretization methods, Numer. Math. 29 (1978).
 """
 
-# arrays of numpy go where those of jax are asked for
-# pyright: reportArgumentType=false
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.parameters import set_leaves
-from jaxbl.fused.single_plant import simulate_plants
 
 from .free_parameters import PRIOR_DEVIATION, FreeParameter
 from .intervals import spread
-from .trajectory import Fit, Windows
+from .trajectory import Fit, Windows, positions_over_noise, simulate_windows
 
 _SHARE = 0.1
 """Of a standard error that twice as many steps may change a number: coverage of 95 % falls by 0.1 % then."""
@@ -58,11 +53,11 @@ def refine_steps(
     study_windows, first, change, left, excess = windows, fit, np.zeros(len(free)), np.zeros(len(free)), 0.0
     steps = study_steps = experiment.run.substeps
     for fits_left in reversed(range(_FITS)):
-        theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(spread(fit).covariance))
+        theta, deviation = fit.theta, np.sqrt(np.diag(spread(fit).covariance))
         model = set_leaves(
             experiment, {parameter.path: np.asarray(parameter.value(theta[i])) for i, parameter in enumerate(free)}
         )
-        jacobian = np.asarray(fit.jacobian).reshape(-1, len(free))
+        jacobian = fit.jacobian.reshape(-1, len(free))
         normal = jacobian.T @ jacobian + np.eye(len(free)) / PRIOR_DEVIATION**2
         # of what diverges nothing is finite, and finer steps are of no help
         with np.errstate(all="ignore"):
@@ -82,7 +77,7 @@ def refine_steps(
         change = np.linalg.solve(normal, jacobian.T @ (finer - windows.finer).ravel())
         windows = replace(windows, finer=finer)
         if np.all(np.abs(change) < _LINEAR * deviation):
-            fit, change = replace(fit, theta=jnp.asarray(theta + change)), np.zeros(len(free))
+            fit, change = replace(fit, theta=theta + change), np.zeros(len(free))
             break
         if fits_left:
             fit = fit_again(windows, fit)
@@ -95,7 +90,4 @@ def refine_steps(
 def _simulate(model: Experiment, windows: Windows, fit: Fit, steps: int) -> np.ndarray:
     """Positions over the noise with so many plant steps in a sample, shape (windows, samples, sides)."""
     model = replace(model, run=replace(model.run, substeps=steps))
-    position = simulate_plants(
-        model, fit.start, np.asarray(windows.torque), np.asarray(windows.time), windows.measured, windows.gain
-    ).position
-    return np.stack([position[side] / float(windows.noise[side]) for side in model.sides], axis=-1)
+    return positions_over_noise(model, windows, simulate_windows(model, windows, fit.start))

@@ -11,15 +11,12 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from scipy.linalg import solve_discrete_are
 
-from jaxbl.chain import Experiment
+from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.drive.effects import Numbers
 
-from .compilation import jit
 from .trajectory import Windows, projected_residual
 
 _COARSE = 10.0 ** np.arange(-12.0, 1.0)
@@ -39,11 +36,10 @@ def kalman_gain(smoothness: float, period: float) -> np.ndarray:
     return covariance[:, 0] / (covariance[0, 0] + 1.0) * np.array([1.0, 1.0 / period])
 
 
-@jit
-def _sizes(experiment: Experiment, windows: Windows, gain: dict[str, Float[Array, " 2"]]) -> Float[Array, " sides"]:
-    """Rms prediction error of each side in rad under a gain; several one by one take as long as at once."""
+def _sizes(experiment: Experiment, windows: Windows, gain: NamedArrays) -> np.ndarray:
+    """Rms prediction error of each side in rad under a gain."""
     residual, _ = projected_residual(experiment, replace(windows, gain=gain))
-    return jnp.stack([windows.noise[side] for side in experiment.sides]) * jnp.sqrt(jnp.mean(residual**2, axis=(0, 1)))
+    return np.array([windows.noise[side] for side in experiment.sides]) * np.sqrt(np.mean(residual**2, axis=(0, 1)))
 
 
 def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, Numbers]:

@@ -18,14 +18,17 @@ from jaxtyping import Array, Float
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import EffectStates, Plant, PlantState
-from jaxbl.records.least_squares import BlockRegression
+from jaxbl.records.least_squares import BlockRegression, column_rms
 
 from .compilation import jit
+from .descent import descend, linearise
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 from .trajectory import Fit
 
 _PASSES = 3
 """Fits, each with the weights of the residuals of the one before."""
+_MOST_STEPS, _SETTLED = 200, 1e-9
+"""Of each fit, and the share of its squares that a step gains which is its last."""
 
 
 Samples = Float[Array, " samples"]
@@ -312,35 +315,54 @@ def shortest(factor: int) -> int:
     return 1 if factor == 1 else 20 * factor + 1
 
 
+class _Point(NamedTuple):
+    """Torques that are left over at a theta, weighted, shape (samples, equations), their derivative, and their squares."""
+
+    theta: np.ndarray
+    residual: np.ndarray
+    slope: np.ndarray
+    deviance: float
+
+
 @jit
+def _miss_torques(
+    experiment: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int, theta: Array
+) -> tuple[Array, Array]:
+    """Torques that the equations of motion leave over after decimation, shape (samples, equations), and their derivative."""
+
+    def miss(theta: Array) -> tuple[Array, Array]:
+        balances = _decimate_balances(set_free_parameters(experiment, free, theta), parts, factor)
+        missed = jnp.stack([equation.residual for equation in balances.values()], axis=-1)
+        return missed, missed
+
+    slope, missed = jax.jacfwd(miss, has_aux=True)(theta)
+    return missed, slope
+
+
 def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int) -> Fit:
     """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
 
     Parts shorter than :func:`shortest` for this decimation must be left out. Residuals and derivatives of the fit have shape
     (1, samples, equations, ...), for :func:`jaxbl.estimation.intervals.spread`.
     """
-    import optimistix as optx
+    precision = np.full(len(free), PRIOR_DEVIATION**-2.0)
 
-    names = list(eqx.filter_eval_shape(balance, experiment, parts[0]))
+    def evaluate(theta: np.ndarray, weights: np.ndarray | float = 1.0) -> _Point:
+        missed, slope = map(np.asarray, _miss_torques(experiment, free, parts, factor, jnp.asarray(theta)))
+        missed = missed * weights
+        deviance = float(np.sum(missed**2) + np.sum(precision * theta**2))
+        return _Point(theta, missed, slope * np.expand_dims(weights, -1), deviance)
 
-    def miss_torques(theta: Array) -> Array:
-        model = set_free_parameters(experiment, free, theta)
-        balances = [balance(model, part) for part in parts]
-        columns = [jnp.concatenate([decimate(equations[name].residual, factor) for equations in balances]) for name in names]
-        return jnp.stack(columns, axis=-1)
-
-    def weigh(theta: Array, weights: Array) -> tuple[Array, Array]:
-        return miss_torques(theta) * weights[None, :], theta / PRIOR_DEVIATION
-
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-
-    def again(_: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        theta = carry[0]
-        weights = 1.0 / jnp.maximum(jnp.sqrt(jnp.mean(miss_torques(theta) ** 2, axis=0)), jnp.finfo(float).tiny)
-        solution = optx.least_squares(weigh, solver, theta, weights, max_steps=200, throw=False)
-        return solution.value, weights, solution.result == optx.RESULTS.successful
-
-    first = jnp.zeros(len(free)), jnp.ones(len(names)), jnp.asarray(True)
-    theta, weights, ended = jax.lax.fori_loop(0, _PASSES, again, first)
-    residual, jacobian = miss_torques(theta) * weights[None, :], jax.jacfwd(miss_torques)(theta) * weights[None, :, None]
-    return Fit(theta, PlantState({}, {}, ()), residual[None], jacobian[None], 0.5 * jnp.sum(residual**2), ended)
+    best, ended = evaluate(np.zeros(len(free))), True
+    for _ in range(_PASSES):
+        left = column_rms(evaluate(best.theta).residual)
+        weights = 1.0 / np.maximum(left, np.finfo(float).tiny)
+        best, ended = descend(
+            evaluate(best.theta, weights),
+            lambda point: linearise(point.residual, point.slope, point.theta, precision),
+            lambda point, change, weights=weights: evaluate(point.theta + change, weights),
+            _MOST_STEPS,
+            lambda point: _SETTLED * point.deviance,
+        )
+    residual, slope = best.residual[None], best.slope[None]
+    return Fit(best.theta, PlantState({}, {}, ()), residual, slope, 0.5 * np.sum(residual**2), ended)

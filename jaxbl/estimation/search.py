@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import Experiment
@@ -17,7 +16,7 @@ from .intervals import Refusal, Spread, refusals, spread
 from .plant_steps import refine_steps
 from .prediction import predictor
 from .segments import Segment, windows_of
-from .trajectory import Fit, Windows, fits
+from .trajectory import Fit, Windows, fit
 
 _LONG, _SHORT = 500, 50
 """Samples of the windows that are tried where no length is asked for."""
@@ -172,7 +171,7 @@ class ParameterSearch:
         reach = np.log(self.settings.spread)
         thetas = np.zeros((self.settings.starts, len(free)))
         thetas[1:] = random.uniform(-reach, reach, thetas[1:].shape)
-        tries = fits(self.experiment, free, windows, thetas, _FEW_STEPS, rounds=1)
+        tries = [fit(self.experiment, free, windows, theta, _FEW_STEPS, rounds=1) for theta in thetas]
         cost = np.array([end.cost for end in tries])
         cost = np.where(np.isfinite(cost), cost, np.inf)
         thetas_found = np.array([end.theta for end in tries])
@@ -196,7 +195,7 @@ class ParameterSearch:
             return fit_from(windows, start).only(np.flatnonzero(fitted))
 
         def fit_from(windows: Windows, start: np.ndarray) -> Fit:
-            return fits(self.experiment, free, windows, start[None], held=~fitted[None])[0]
+            return fit(self.experiment, free, windows, start, held=~fitted)
 
         left = tuple(itertools.compress(free, fitted))
         sized: list[tuple[float, Fitted]] = []
@@ -205,12 +204,12 @@ class ParameterSearch:
             smoothness: dict[str, float] = {}
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
-                    windows, smoothness = predictor(set_free_parameters(self.experiment, free, jnp.asarray(theta)), windows)
-                    theta = np.asarray(fit_from(windows, theta).theta)
+                    windows, smoothness = predictor(set_free_parameters(self.experiment, free, theta), windows)
+                    theta = fit_from(windows, theta).theta
             end = fit_from(windows, theta).only(np.flatnonzero(fitted))
             windows, end, errors, steps = refine_steps(self.experiment, left, windows, end, fit_again)
             width = spread(end).with_error(*errors)
-            size = float(jnp.sum(jnp.log(jnp.diag(width.covariance))))
+            size = float(np.sum(np.log(np.diag(width.covariance))))
             if np.isfinite(size):
                 sized.append((size, Fitted(left, end, width, windows, firsts, smoothness, steps, errors)))
         if not sized:
@@ -228,7 +227,7 @@ def _between(best: Fitted, other: Fitted, grows: bool) -> Fitted:
     Then each length finds other numbers, by more than noise does: free runs weigh what is missing by its duration; and what
     a disturbance leaves is alike for as long as a window lasts.
     """
-    change = np.asarray(other.fit.theta - best.fit.theta)
+    change = other.fit.theta - best.fit.theta
     width = best.spread
     if grows or float(width.variance) > NOISE_ALONE**2:
         width = spread(best.fit, best.samples).with_error(change, *best.errors)

@@ -29,6 +29,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.records.signal_quality import estimate_white_noise
 from jaxbl.workers import announce
 
+from .descent import descend, linearise
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, free_values
 from .intervals import LIMIT, Spread, long_run, step_at_limit, without_gain
 from .prediction import kalman_gain
@@ -60,7 +61,6 @@ _PART = 4000
 """Samples that the first fits are made to."""
 _SETTLED = 0.01
 """Gain in minus twice the log-likelihood below which a fit has ended: a tenth of a standard error."""
-_MOST_REJECTED = 8
 _RESOLVED = 0.15
 """Of a plant step times the fastest frequency of the drive: Moreau's rule is then off by a thousandth of it."""
 SHOWN = float(chdtri(1.0, 1e-3))
@@ -316,30 +316,26 @@ class UnseenLoad:
         theta, start = np.split(change, [len(self.free)])
         return point._replace(theta=point.theta + theta, start=point.start + start.reshape(point.start.shape))
 
-    # far from the solution errors may be so large that their squares are not finite: no step gains there
-    @np.errstate(all="ignore")
     def solve(self, point: Point, steps: int) -> Point:
         """Levenberg-Marquardt from a point, with its predictor."""
-        best, damping, size = point, 1e-3, None
-        for _ in range(steps):
-            if not np.isfinite(best.deviance):
-                break
-            slope = self.slopes(best, size)
-            matrix = slope.T @ slope / best.variance + np.diag(self.precision)
-            size = np.diag(matrix) ** -0.5
-            towards = slope.T @ best.errors / best.variance + self.precision * best.away
+        size = None
+
+        def linearise_here(point: Point) -> tuple[np.ndarray, np.ndarray]:
+            nonlocal size
+            deviation = np.sqrt(point.variance)
+            slope = self.slopes(point, size) / deviation
+            matrix, towards = linearise(point.errors / deviation, slope, point.away, self.precision)
             towards[self.held] = 0.0
-            for _ in range(_MOST_REJECTED):
-                change = -np.linalg.solve(matrix + damping * np.diag(size**-2.0), towards)
-                following = self.evaluate(self._move(best, np.clip(change, -1.0, 1.0)))
-                gained = best.deviance - following.deviance
-                if gained > 0.0:
-                    best, damping = following, max(0.1 * damping, 1e-9)
-                    break
-                damping *= 8.0
-            if gained < _SETTLED:
-                break
-        return best
+            size = np.diag(matrix) ** -0.5
+            return matrix, towards
+
+        return descend(
+            point,
+            linearise_here,
+            lambda point, change: self.evaluate(self._move(point, np.clip(change, -1.0, 1.0))),
+            steps,
+            lambda _: _SETTLED,
+        )[0]
 
     def resume(self, point: Point, steps: int, smoothness: float | None = None) -> Point:
         """Go on from the numbers of a point, of another model or with another predictor; as :meth:`solve`."""

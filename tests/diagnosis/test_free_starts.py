@@ -14,7 +14,6 @@ from jaxbl.diagnosis.free_starts import best_runs, count_seen
 from jaxbl.diagnosis.neutral_effects import with_torques
 from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.segments import segments_of, windows_of
 from jaxbl.estimation.trajectory import projected_residual
 
@@ -43,7 +42,7 @@ def test_runs_are_those_of_the_fit(log, from_rest):
         measured={side: readings[:, :seen] for side, readings in windows.measured.items()},
         finer=windows.finer[:, :seen],
     )
-    expected, start = jit(projected_residual)(model, first, 8, from_rest)
+    expected, start = projected_residual(model, first, 8, from_rest)
     assert actual.residual.shape == (8, 250, 2) and seen == 50
     assert np.sqrt(np.mean(np.square(expected))) > 1.05
     assert actual.residual[:, :seen] == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)

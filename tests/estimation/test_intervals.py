@@ -10,7 +10,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import interval, profile, spread
-from jaxbl.estimation.trajectory import cut, fits
+from jaxbl.estimation.trajectory import cut, fit
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 
@@ -35,7 +35,7 @@ def simulate_mass(seed=0, size=0.2, drag=0.15):
 def fit_numbers(paths, windows):
     experiment = prepare(read_config(rigid_study({"run.sample_period": PERIOD, "run.substeps": 1})))
     free = make_free_parameters(experiment, paths, 1.0)
-    (result,) = fits(experiment, free, windows, np.zeros((1, len(free))))
+    result = fit(experiment, free, windows, np.zeros(len(free)))
     return experiment, free, result
 
 
@@ -62,8 +62,8 @@ def test_where_it_is_not_the_profile_follows_the_likelihood():
     scale = float(width.variance) * float(width.inflation[1]) ** 2
 
     def excess_cost(value):
-        theta = np.array([[result.theta[0], np.log(value / 0.15)]])
-        (bound_fit,) = fits(experiment, free, windows, theta, 60, np.array([[False, True]]))
+        theta = np.array([result.theta[0], np.log(value / 0.15)])
+        bound_fit = fit(experiment, free, windows, theta, 60, np.array([False, True]))
         return 2.0 * (float(bound_fit.cost) - float(result.cost)) / scale - 3.841
 
     best = 0.15 * np.exp(float(result.theta[1]))

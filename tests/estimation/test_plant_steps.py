@@ -10,7 +10,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import spread
 from jaxbl.estimation.plant_steps import refine_steps
-from jaxbl.estimation.trajectory import cut, fits
+from jaxbl.estimation.trajectory import cut, fit
 
 PERIOD, SAMPLES = 2e-2, 400
 PATHS = ["drive.motor_inertia", "drive.motor_viscous", "effects.load.gravity.torque"]
@@ -34,12 +34,9 @@ def refine(noise, made_with, steps=2):
     windows = cut(torque, readings, PERIOD, states, {"motor": noise}, 100)
     free = make_free_parameters(experiment, PATHS, 1.0)
 
-    def fit(windows, theta):
-        return fits(experiment, free, windows, np.asarray(theta)[None])[0]
-
-    first = fit(windows, np.zeros(3))
+    first = fit(experiment, free, windows, np.zeros(3))
     _, refined, errors, steps = refine_steps(
-        experiment, free, windows, first, lambda windows, fitted: fit(windows, fitted.theta)
+        experiment, free, windows, first, lambda windows, fitted: fit(experiment, free, windows, fitted.theta)
     )
     deviation = np.sqrt(np.diag(spread(refined).with_error(*errors).covariance))
     away = [

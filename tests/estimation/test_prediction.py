@@ -8,7 +8,6 @@ from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import spread
 from jaxbl.estimation.prediction import kalman_gain, predictor
@@ -52,9 +51,8 @@ def prepare_mass():
     return experiment, make_free_parameters(experiment, ["drive.motor_inertia", "drive.motor_viscous"], 1.0)
 
 
-@jit
 def fit_numbers(experiment, free, windows):
-    return fit(experiment, free, windows, jnp.zeros(2))
+    return fit(experiment, free, windows, np.zeros(2))
 
 
 def cut_windows(torque, readings, samples):
