@@ -27,7 +27,6 @@ LATE_MODULES = (
     "jaxbl.__main__",
     "jaxbl.cli",
     "jaxbl.datasheet",
-    "optimistix",
     "pyarrow.dataset",
     "pyarrow.pandas_compat",
     "PIL.Image",

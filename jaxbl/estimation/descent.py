@@ -39,9 +39,9 @@ def descend(
         if not np.isfinite(best.deviance):
             return best, False
         matrix, towards = linearise(best)
-        diagonal = np.diag(np.diag(matrix))
+        size = np.diag(matrix) ** -0.5
         for _ in range(_MOST_REJECTED):
-            following = move(best, -np.linalg.solve(matrix + damping * diagonal, towards))
+            following = move(best, -np.linalg.solve(matrix + damping * np.diag(size**-2.0), towards))
             gained = best.deviance - following.deviance
             if gained > 0.0:
                 best, damping = following, max(0.1 * damping, _LEAST)
@@ -53,15 +53,17 @@ def descend(
 
 
 def linearise(
-    residual: np.ndarray, slope: np.ndarray, numbers: np.ndarray, precision: np.ndarray
+    residual: np.ndarray, slope: np.ndarray, numbers: np.ndarray, precision: np.ndarray, variance: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix of least squares and half the derivative of their sum.
 
     Args:
-        residual: over its standard deviation, any shape.
+        residual: any shape.
         slope: its derivative, shape (..., numbers).
         numbers: off the mean of their prior, shape (numbers,).
         precision: of their prior, shape (numbers,).
+        variance: of a residual.
     """
     slope = slope.reshape(-1, len(numbers))
-    return slope.T @ slope + np.diag(precision), slope.T @ residual.ravel() + precision * numbers
+    towards = slope.T @ residual.ravel() / variance + precision * numbers
+    return slope.T @ slope / variance + np.diag(precision), towards

@@ -82,7 +82,7 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
 
 def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, Quantity]:
     """Values with standard errors and 95 % intervals, by path."""
-    theta, deviation = np.asarray(fit.theta), np.sqrt(np.diag(width.covariance))
+    theta, deviation = fit.theta, np.sqrt(np.diag(width.covariance))
     return {
         parameter.path: Quantity(
             float(parameter.value(coordinate)),

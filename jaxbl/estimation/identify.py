@@ -140,7 +140,7 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         search_fit = ParameterSearch(nominal, segments, settings, at_rest=at_rest, name=str(record.path)).run(free)
         done()
         # by NumPy, as in the summary: JAX's exponential function may differ in the last digit
-        values = free_values(search_fit.free, np.asarray(search_fit.fit.theta))
+        values = free_values(search_fit.free, search_fit.fit.theta)
         fitted = set_leaves(nominal, arrays(values))
         profiles = {}
         if settings.profile:

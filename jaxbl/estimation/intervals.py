@@ -55,37 +55,49 @@ class Spread(NamedTuple):
         more = np.sqrt(np.diag(wide) / np.diag(self.covariance))
         return self._replace(covariance=wide, inflation=self.inflation * more)
 
+    def only(self, places: np.ndarray) -> "Spread":
+        """The spread of some numbers; what is left open of the others is no information."""
+        covariance = self.covariance[np.ix_(places, places)]
+        return Spread(covariance, invert(covariance), self.variance, self.inflation[places])
+
 
 def spread(fit: Fit, least: int = 1) -> Spread:
     """Covariance of theta by the sandwich J+ E[r r^T] J+^T, the middle by Newey and West with Andrews' bandwidth.
 
     `least`: samples over which residuals may be correlated, at least.
     """
-    return spread_of(np.asarray(fit.residual, float), np.asarray(fit.jacobian, float), 2 * len(fit.start.position), least)
+    return spread_of(fit.residual, fit.jacobian, 2 * len(fit.start.position), least)
 
 
-def spread_of(residual: np.ndarray, jacobian: np.ndarray, states: int, least: int = 1) -> Spread:
-    """The same of residuals, their derivatives (shapes as of a fit), and the number of a window's initial states."""
+# of what diverges nothing is finite
+@np.errstate(all="ignore")
+def spread_of(
+    residual: np.ndarray, jacobian: np.ndarray, states: int, least: int = 1, precision: np.ndarray | float = 0.0
+) -> Spread:
+    """The same of residuals, their derivatives (shapes as of a fit), the number of a window's initial states, and the
+    precision of a prior of theta, shape (parameters,)."""
     windows, samples, _, parameters = jacobian.shape
     freedom = residual.size - parameters - windows * states
-    flat = jacobian.reshape(-1, parameters)
-    normal = flat.T @ flat
-    size = np.sqrt(np.diag(normal))
+    variance, flat = np.sum(residual**2) / freedom, jacobian.reshape(-1, parameters)
+    prior = np.diag(np.broadcast_to(precision, parameters))
+    information = flat.T @ flat / variance + prior
+    size = np.sqrt(np.diag(information))
     size = np.where(size > 0.0, size, 1.0)
-    scale = np.outer(size, size)
-    scores = np.einsum("wtsp,wts->wtp", jacobian / size, residual).reshape(windows * samples, parameters)
-    # of what diverges nothing is finite
-    with np.errstate(all="ignore"):
-        variance = np.sum(residual**2) / freedom
-        middle = long_run(scores, least) * residual.size / freedom
-        unit = normal / scale
-        inverse = np.full_like(unit, np.nan)
-        if np.isfinite(unit).all():
-            inverse = np.linalg.pinv(unit, 10.0 * len(unit) * np.finfo(float).eps, hermitian=True)
-        plain = variance * inverse / scale
-        sandwich = inverse @ middle @ inverse / scale
-        covariance, inflation = without_gain(sandwich, plain)
-        return Spread(covariance, normal / variance, variance, inflation)
+    scores = np.einsum("wtsp,wts->wtp", jacobian / size, residual).reshape(windows * samples, parameters) / variance
+    middle = long_run(scores, least) * np.outer(size, size) * residual.size / freedom + prior
+    plain = invert(information)
+    covariance, inflation = without_gain(plain @ middle @ plain, plain)
+    return Spread(covariance, information, variance, inflation)
+
+
+def invert(matrix: np.ndarray) -> np.ndarray:
+    """Invert a symmetric positive matrix; directions that are lost in rounding keep what rounding leaves."""
+    if not len(matrix) or not np.isfinite(matrix).all():
+        return matrix
+    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    values = np.maximum(values, 1e-14 * len(values) * values[-1])
+    return (vectors / values) @ vectors.T / np.outer(size, size)
 
 
 def without_gain(sandwich: np.ndarray, plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,7 +185,7 @@ def profile(
     :func:`spread`.
     """
     count = len(free)
-    centre, covariance = np.asarray(best.theta), width.covariance
+    centre, covariance = best.theta, width.covariance
     deviation = np.sqrt(np.diag(covariance))
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
     worth = float(width.variance) * width.inflation**2

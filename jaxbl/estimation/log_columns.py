@@ -52,7 +52,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)[None, :]).ravel()
     for i, side in enumerate(fitted.sides):
         column = np.full(count, np.nan)
-        column[rows] = float(search_fit.windows.noise[side]) * np.asarray(search_fit.fit.residual[:, :, i]).ravel()
+        column[rows] = float(search_fit.windows.noise[side]) * search_fit.fit.residual[:, :, i].ravel()
         columns[f"{side}.residual"] = column
     pieces = []
     for segment in segments:

@@ -28,7 +28,7 @@ from .regression import balance
 from .search import SearchFit
 from .segments import Segment, at_period, segments_of
 from .trajectory import Fit, cut
-from .unseen_load import SHOWN, Gap, GapSearch, Point, UnseenLoad, half_gap_of, inverse, is_known, widths
+from .unseen_load import SHOWN, Gap, GapSearch, Point, UnseenLoad, half_gap_of, is_known, widths
 
 
 class Alone(NamedTuple):
@@ -176,7 +176,7 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
 def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collection[int]) -> SearchFit:
     """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
     sought = np.setdiff1d(np.arange(len(model.free)), [*absent])
-    width_sought = _only(width, sought)
+    width_sought = width.only(sought)
     refused, condition = refusals([model.free[i] for i in sought], width_sought)
     visible = sought[np.sqrt(np.diag(width_sought.covariance)) < UNSEEN]
     torque = np.concatenate([segment.torque for segment in model.segments])
@@ -184,20 +184,14 @@ def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collec
     windows = cut(torque, {}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque))
     residual = (point.errors / model.noise)[None, :, None]
     none = np.zeros((*residual.shape, 0))
-    fit = Fit(jnp.asarray(point.theta[visible]), windows.start, residual, none, 0.5 * np.sum(residual**2), np.True_)
+    fit = Fit(point.theta[visible], windows.start, residual, none, 0.5 * np.sum(residual**2), True)
     return SearchFit(
         free=tuple(model.free[i] for i in visible), fit=fit,
-        spread=_only(width, visible)._replace(variance=point.variance / model.noise**2),
+        spread=width.only(visible)._replace(variance=point.variance / model.noise**2),
         windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
         refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
         held=[], condition=condition, starts=[], steps=model.experiment.run.substeps,
     )  # fmt: skip
-
-
-def _only(width: Spread, places: np.ndarray) -> Spread:
-    """Return the spread of some numbers; what is left open of the others is no information."""
-    covariance = width.covariance[np.ix_(places, places)]
-    return Spread(covariance, inverse(covariance), width.variance, width.inflation[places])
 
 
 def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:

@@ -77,7 +77,7 @@ def refine_steps(
         change = np.linalg.solve(normal, jacobian.T @ (finer - windows.finer).ravel())
         windows = replace(windows, finer=finer)
         if np.all(np.abs(change) < _LINEAR * deviation):
-            fit, change = replace(fit, theta=theta + change), np.zeros(len(free))
+            fit, change = fit._replace(theta=theta + change), np.zeros(len(free))
             break
         if fits_left:
             fit = fit_again(windows, fit)
@@ -90,4 +90,4 @@ def refine_steps(
 def _simulate(model: Experiment, windows: Windows, fit: Fit, steps: int) -> np.ndarray:
     """Positions over the noise with so many plant steps in a sample, shape (windows, samples, sides)."""
     model = replace(model, run=replace(model.run, substeps=steps))
-    return positions_over_noise(model, windows, simulate_windows(model, windows, fit.start))
+    return positions_over_noise(model, windows, simulate_windows(model, windows, fit.start).position)

@@ -8,7 +8,7 @@ References: G. Golub, V. Pereyra, Separable nonlinear least squares, Inverse Pro
 H. G. Bock, Recent advances in parameter identification techniques for ODE (1983).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbl.chain import Experiment, PlantState, correct_by_readings
 from jaxbl.drive.parameters import set_leaves
@@ -25,9 +25,9 @@ from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivative
 from .descent import descend, linearise
 from .free_parameters import PRIOR_DEVIATION, FreeParameter
 
-Residuals = Float[Array, "windows samples sides"]
+Residuals = Float[np.ndarray, "windows samples sides"]
 """Of positions over the noise."""
-Theta = Float[Array, " parameters"]
+Theta = Float[np.ndarray, " parameters"]
 """Coordinates of the free parameters."""
 _INNER, _OUTER = 2, 12
 """Initial states tried for a window at each step of the fit; and where they are sought anew."""
@@ -59,14 +59,14 @@ class Windows(eqx.Module):
             None: free runs, output error.
     """
 
-    torque: Float[Array, "windows samples"]
-    measured: dict[str, Float[Array, "windows samples"]]
-    time: Float[Array, " windows"]
+    torque: Float[np.ndarray, "windows samples"]
+    measured: dict[str, Float[np.ndarray, "windows samples"]]
+    time: Float[np.ndarray, " windows"]
     start: PlantState
-    noise: dict[str, Float[Array, ""]]
-    at_rest: Bool[Array, " windows"]
+    noise: dict[str, Float[np.ndarray, ""]]
+    at_rest: Bool[np.ndarray, " windows"]
     finer: Residuals
-    gain: dict[str, Float[Array, " 2"]] | None = None
+    gain: dict[str, Float[np.ndarray, " 2"]] | None = None
 
     def only(self, places: np.ndarray) -> "Windows":
         """Some of the windows."""
@@ -85,7 +85,7 @@ _IN_COLUMNS = Windows(True, True, True, True, False, True, True, False)  # type:
 """What has a row a window."""
 
 
-class Fit(eqx.Module):
+class Fit(NamedTuple):
     """Result of a fit from one start.
 
     Attributes:
@@ -101,32 +101,29 @@ class Fit(eqx.Module):
     theta: Theta
     start: PlantState
     residual: Residuals
-    jacobian: Float[Array, "windows samples sides parameters"]
-    cost: Float[Array, ""]
-    converged: Array
+    jacobian: Float[np.ndarray, "windows samples sides parameters"]
+    cost: float | np.floating
+    converged: bool
 
     def only(self, places: np.ndarray) -> "Fit":
         """Some of the numbers; the others were held."""
-        return replace(self, theta=self.theta[places], jacobian=self.jacobian[..., places])
+        return self._replace(theta=self.theta[places], jacobian=self.jacobian[..., places])
 
 
 def simulate_windows(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
     """Simulate windows from some initial states; states at the samples, leaves of shape (windows, samples)."""
-    readings = {} if windows.gain is None else windows.measured
-    return simulate_plants(
-        experiment, start, np.asarray(windows.torque), np.asarray(windows.time), readings, windows.gain
-    )  # fmt: skip
+    return simulate_plants(experiment, start, windows.torque, windows.time, windows.measured, windows.gain)
 
 
-def positions_over_noise(experiment: Experiment, windows: Windows, states: PlantState) -> np.ndarray:
+def positions_over_noise(experiment: Experiment, windows: Windows, positions: Mapping[str, Any]) -> np.ndarray:
     """Positions of the sides over the noise, shape (windows, samples, sides)."""
-    return np.stack([states.position[side] / float(windows.noise[side]) for side in experiment.sides], axis=-1)
+    return np.stack([positions[side] / float(windows.noise[side]) for side in experiment.sides], axis=-1)
 
 
 def _leave(experiment: Experiment, windows: Windows, states: PlantState) -> np.ndarray:
     """Residuals over the noise of simulated states."""
-    measured = positions_over_noise(experiment, windows, PlantState(windows.measured, {}, ()))
-    return measured - positions_over_noise(experiment, windows, states) - windows.finer
+    measured, simulated = (positions_over_noise(experiment, windows, x) for x in (windows.measured, states.position))
+    return measured - simulated - windows.finer
 
 
 def _differentiate(
@@ -149,9 +146,9 @@ def _differentiate_some(
     runs, samples = windows.torque.shape
     ways = [Direction(numbers={number.path: float(number.slope(x))}) for number, x in zip(free, theta, strict=False)]
     ways += [Direction(state=row) for row in np.eye(count).tolist()]
-    time = np.asarray(windows.time)[:, None] + float(experiment.run.sample_period) * np.arange(samples)
-    corrected = correct_by_readings(states, windows.measured, windows.gain or {})
-    flat = jax.tree.map(lambda leaf: np.ravel(leaf), corrected)
+    time = windows.time[:, None] + float(experiment.run.sample_period) * np.arange(samples)
+    readings: Any = windows.measured
+    flat = jax.tree.map(np.ravel, correct_by_readings(states, readings, windows.gain or {}))
     changes, _ = step_derivatives(experiment, flat, np.ravel(windows.torque), time.ravel(), ways)
     steps = changes.reshape(len(ways), count, runs, samples).transpose(3, 2, 1, 0)
     places: Any = shape.unflatten(range(count))
@@ -365,9 +362,9 @@ def cut(
     return Windows(
         torque=split(torque),
         measured={side: split(values) for side, values in measured.items()},
-        time=first + period * samples * np.arange(count),  # pyright: ignore[reportArgumentType]
+        time=first + period * samples * np.arange(count),
         start=PlantState(start.position, still, start.effects),
-        noise={side: np.asarray(value, float) for side, value in noise.items()},  # pyright: ignore[reportArgumentType]
+        noise={side: np.asarray(value, float) for side, value in noise.items()},
         at_rest=standing,
-        finer=np.zeros((count, samples, len(measured))),  # pyright: ignore[reportArgumentType]
+        finer=np.zeros((count, samples, len(measured))),
     )

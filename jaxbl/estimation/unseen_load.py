@@ -31,7 +31,7 @@ from jaxbl.workers import announce
 
 from .descent import descend, linearise
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, free_values
-from .intervals import LIMIT, Spread, long_run, step_at_limit, without_gain
+from .intervals import LIMIT, Spread, spread_of, step_at_limit
 from .prediction import kalman_gain
 from .regression import begin_states
 from .segments import Segment, reading_noise
@@ -322,9 +322,8 @@ class UnseenLoad:
 
         def linearise_here(point: Point) -> tuple[np.ndarray, np.ndarray]:
             nonlocal size
-            deviation = np.sqrt(point.variance)
-            slope = self.slopes(point, size) / deviation
-            matrix, towards = linearise(point.errors / deviation, slope, point.away, self.precision)
+            slope = self.slopes(point, size)
+            matrix, towards = linearise(point.errors, slope, point.away, self.precision, point.variance)
             towards[self.held] = 0.0
             size = np.diag(matrix) ** -0.5
             return matrix, towards
@@ -392,22 +391,13 @@ class UnseenLoad:
 
     def spread(self, point: Point) -> Spread:
         """Covariance of theta, of data and priors together."""
-        count, precision, size = len(self.free), self.precision.copy(), None
+        precision, size = self.precision.copy(), None
         precision[self.held] = 1e12
         for _ in range(2):
-            slope = self.slopes(point, size) / np.sqrt(point.variance)
-            size = (np.sum(slope**2, axis=0) + precision) ** -0.5
-        assert size is not None
-        unit, prior = slope * size, np.diag(precision * size**2)
-        middle = long_run(unit * (point.errors / np.sqrt(point.variance))[:, None]) + prior
-        white = inverse(unit.T @ unit + prior)[:count]
-        scale = np.outer(size, size)[:count, :count]
-        inner = white[:, :count] * scale
-        # by a root of the middle: never negative, whatever rounding does
-        size_of, ways = np.linalg.eigh(middle)
-        half = white @ (ways * np.sqrt(np.maximum(size_of, 0.0)))
-        covariance, inflation = without_gain(half @ half.T * scale, inner)
-        return Spread(covariance, inverse(inner), point.variance, inflation)
+            slope = self.slopes(point, size)
+            size = (np.sum(slope**2, axis=0) / point.variance + precision) ** -0.5
+        whole = spread_of(point.errors[None, :, None], slope[None, :, None], 0, precision=precision)
+        return whole.only(np.arange(len(self.free)))
 
 
 _QUIET = 1e-4
@@ -416,16 +406,6 @@ _DRAWS = 2
 """Of that noise."""
 _OTHERS = 10.0, 0.1
 """Factors on the smoothness of predictors whose numbers are compared with the best one's."""
-
-
-def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Invert a symmetric positive matrix; directions that are lost in rounding keep what rounding leaves."""
-    if not len(matrix) or not np.isfinite(matrix).all():
-        return matrix
-    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
-    values = np.maximum(values, 1e-14 * len(values) * values[-1])
-    return (vectors / values) @ vectors.T / np.outer(size, size)
 
 
 class Gap(NamedTuple):

@@ -32,7 +32,7 @@ from . import Unsupported, raising_unsupported, warn_of_scan
 
 LoopDefinition = tuple[Callable[..., Any], Sequence[Any], dict[str, Any]]
 """A function of one sample, examples of its arguments, and options of its :class:`jaxbl.fused.llvm.Loop`."""
-_DEPENDENCIES = "equinox", "jax", "jaxlib", "lineax", "llvmlite", "numpy", "optimistix"
+_DEPENDENCIES = "equinox", "jax", "jaxlib", "llvmlite", "numpy"
 _UNUSED_DAYS = 30.0
 """Days after which programs of another version of the package are deleted, if nothing has used them."""
 

@@ -179,13 +179,11 @@ def test_residual_correlation_widens_intervals():
     residual = np.zeros(samples)
     for i in range(1, samples):
         residual[i] = rho * residual[i - 1] + draws[i]
-    group = jnp.ones((10, samples // 10, 1, 1))
+    group = np.ones((10, samples // 10, 1, 1))
     plant_state = PlantState({"motor": jnp.zeros(10)}, {"motor": jnp.zeros(10)}, ())
-    result = spread(
-        Fit(jnp.zeros(1), plant_state, jnp.asarray(residual).reshape(10, -1, 1), group, jnp.zeros(()), jnp.ones(()))
-    )
+    result = spread(Fit(np.zeros(1), plant_state, residual.reshape(10, -1, 1), group, 0.0, True))
     np.testing.assert_allclose(result.inflation, np.sqrt((1.0 + rho) / (1.0 - rho)), rtol=0.1)
-    white = spread(Fit(jnp.zeros(1), plant_state, jnp.asarray(draws).reshape(10, -1, 1), group, jnp.zeros(()), jnp.ones(())))
+    white = spread(Fit(np.zeros(1), plant_state, draws.reshape(10, -1, 1), group, 0.0, True))
     np.testing.assert_allclose(white.inflation, 1.0, rtol=0.05)
 
 
