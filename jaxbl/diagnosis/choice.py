@@ -14,7 +14,7 @@ from jaxbl.drive.effects import EFFECTS
 from jaxbl.errors import InputError
 
 from .blocks import standard_errors_better
-from .confidence import Finding, weigh
+from .confidence import Finding, missing_power, weigh
 from .effect_search import EffectSearch, Explanation, VerdictName
 from .expected_errors import expected_errors, list_failed
 from .fitted_model import FittedModel
@@ -101,6 +101,7 @@ class Choice:
         self.search = EffectSearch(setup.bare, setup.free, prior, self.log, exact, stated.expected, self._check_input)
         self.search.history += history
         self.before = self.log.compare(setup.nominal)
+        self._left: tuple[FittedModel, float, list[str]] | None = None
 
     def _check_input(self, fitted: FittedModel) -> None:
         """End the search if a model shows that the machine did not feel noise of the input that drives models."""
@@ -117,20 +118,39 @@ class Choice:
             reason = f"a model with {shown_by} shows that the machine did not feel it"
             self._begin(setup, Step("drive models without noise of the input", None, None, True, reason))
             return self.choose()
+        explanation, findings = self._keep_likely(explanation)
         fitted, compared = explanation.fitted, self.search.compare(explanation.fitted)
         if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.difference:
             fitted, compared = self._as_given(fitted), self.before
-        findings = weigh(explanation)
         fits, closest = self.search.fits, _closest(explanation)
         numbers_off = fits is self.search.rough and fitted is explanation.fitted
         return Chosen(explanation, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
+    def _keep_likely(self, explanation: Explanation) -> tuple[Explanation, tuple[Finding, ...]]:
+        """Leave out effects in whose place something unknown is likelier, one after the other."""
+        while True:
+            findings = weigh(explanation, self._find_left(explanation.fitted)[0] if explanation.fitted.names else 0.0)
+            unlikely = [f for f in findings if not f.is_likely and f.effect not in self.search.expected]
+            if not unlikely:
+                return explanation, findings
+            explanation = self.search.leave_out(explanation, min(unlikely, key=lambda f: f.confidence).effect)
+
+    def _find_left(self, fitted: FittedModel) -> tuple[float, list[str]]:
+        """Find the torque that a model leaves of the log where a complete one would leave less, over the driving torque, and
+        the channels in which it leaves more."""
+        if self._left is None or self._left[0] is not fitted:
+            driving, compared = self.search.fits.given.drive, self.log.compare(fitted.experiment)
+            expected = expected_errors(self.log, fitted, compared, self.setup.input_noise, driving)
+            failed = list_failed(self.log.with_slow(compared), expected)
+            torque = missing_power(fitted.experiment, compared.errors, expected) ** 0.5 if failed else 0.0
+            self._left = fitted, torque / driving, failed
+        return self._left[1:]
+
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
         fitted = chosen.fitted
-        compared, away = self.log.compare(fitted.experiment), np.abs(fitted.theta[: len(chosen.prior)]) / chosen.prior
-        expected = expected_errors(self.log, fitted, compared, self.setup.input_noise, chosen.driving)
-        if np.max(away, initial=0.0) > LIMITS.far or not list_failed(self.log.with_slow(compared), expected):
+        away = np.abs(fitted.theta[: len(chosen.prior)]) / chosen.prior
+        if np.max(away, initial=0.0) > LIMITS.far or not self._find_left(fitted)[1]:
             return None
         tables = tabulate(self.log, fitted.experiment, chosen.compared, lacking, self.setup.sliding)
         z, reason = (None, "no table predicts better") if tables is None else (tables.z, "predicts better, and has no name")

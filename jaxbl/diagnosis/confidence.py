@@ -34,20 +34,27 @@ class Finding(NamedTuple):
     numbers: Numbers
     alternatives: tuple[tuple[str, float], ...]
 
+    @property
+    def is_likely(self) -> bool:
+        """True if it, or another effect that is listed in its place, is likelier than not."""
+        chance = self.confidence + sum(chance for _, chance in self.alternatives)
+        return chance > 1.0 - chance
 
-def weigh(explanation: Explanation) -> tuple[Finding, ...]:
-    """Weigh the effects that were found."""
-    return tuple(_weigh(explanation, name) for name in explanation.fitted.names)
+
+def weigh(explanation: Explanation, left: float = 0.0) -> tuple[Finding, ...]:
+    """Weigh the effects that were found; `left`: torque that is still missing, over the driving torque."""
+    return tuple(_weigh(explanation, name, left) for name in explanation.fitted.names)
 
 
-def _weigh(explanation: Explanation, name: str) -> Finding:
+def _weigh(explanation: Explanation, name: str, left: float) -> Finding:
     fitted, gain = explanation.fitted, explanation.gains[name]
     odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
     if (plain := special_case(fitted, name)) is not None:
         # as likely by the fit
         odds[plain] = 1.0
-    # what is still unknown may stand in its place: odds by the squares of gains part right from wrong on generated logs
-    unknown = (max(explanation.largest_gain, 0.0) / max(gain.nats, 1.0)) ** 2
+    # what is still unknown may stand in its place: odds by the squares of gains, and of torques, part right from wrong on
+    # generated logs
+    unknown = max(explanation.largest_gain / max(gain.nats, 1.0), left / max(fitted.share(name), 1e-300)) ** 2
     total = 1.0 + sum(odds.values()) + unknown
     # no surer than that its torque is not zero, nor than that it makes the model better by blocks
     least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
@@ -64,19 +71,20 @@ def _certainty(fitted: FittedModel, name: str) -> float:
     return float(2.0 * ndtr(max(z)) - 1.0) if z else 1.0
 
 
-def explained_share(experiment: Experiment, before: Errors, after: Errors, expected: Mapping[str, Expected]) -> float | None:
-    """Share of the missing torque's power, beyond noise and smoothing, that a model takes away; both sides at the motor.
+def missing_power(experiment: Experiment, errors: Errors, expected: Mapping[str, Expected]) -> float:
+    """Mean square of the torque that is missing beyond noise and smoothing, both sides at the motor, (N m)^2.
 
-    What the fit leaves open of its numbers counts as missing. None where nothing is missing.
+    What the fit leaves open of a model's numbers counts as missing.
     """
+    total = 0.0
+    for side in experiment.sides:
+        channel = expected[f"torque_{side}"]
+        more = errors[f"torque_{side}"] ** 2 - channel.noise**2 - channel.rounding**2
+        total += max(more, 0.0) / float(experiment.drive.ratio(side)) ** 2
+    return total
 
-    def beyond(errors: Errors) -> float:
-        total = 0.0
-        for side in experiment.sides:
-            channel = expected[f"torque_{side}"]
-            more = errors[f"torque_{side}"] ** 2 - channel.noise**2 - channel.rounding**2
-            total += max(more, 0.0) / float(experiment.drive.ratio(side)) ** 2
-        return total
 
-    missing = beyond(before)
-    return 1.0 - beyond(after) / missing if missing > 0.0 else None
+def explained_share(experiment: Experiment, before: Errors, after: Errors, expected: Mapping[str, Expected]) -> float | None:
+    """Share of the missing torque's power that a model takes away; None where nothing is missing."""
+    missing = missing_power(experiment, before, expected)
+    return 1.0 - missing_power(experiment, after, expected) / missing if missing > 0.0 else None

@@ -21,7 +21,7 @@ from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.records.least_squares import column_rms
 from jaxbl.workers import announce
 
-from .blocks import mean_squares, standard_errors_better, standard_errors_between
+from .blocks import standard_errors_better, standard_errors_between
 from .candidates import Candidate, EffectNumbers, are_possible, contains, replaces, variants_of
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
@@ -70,7 +70,7 @@ class Gain(NamedTuple):
     @property
     def worth(self) -> float:
         """Nats as far as the blocks agree, whose z standard errors are z²/2 nats."""
-        by_blocks = 0.5 * self.standard_errors * abs(self.standard_errors)
+        by_blocks = 2.0 * self.standard_errors * abs(self.standard_errors)
         agreed = min(self.nats, by_blocks, key=abs) if self.nats * by_blocks > 0.0 else by_blocks
         return float(np.clip(agreed, -700.0, 700.0))
 
@@ -178,14 +178,14 @@ class EffectSearch:
 
     def gain(self, before: FittedModel, after: FittedModel) -> Gain:
         """Tell what one model gains over another; infinite where one of them cannot be."""
-        asked = float(np.sqrt(2.0 * max(before.log_odds - after.log_odds, 0.0)))
+        asked = float(np.sqrt(0.5 * max(before.log_odds - after.log_odds, 0.0)))
         if not self._is_possible(after):
             return Gain(-np.inf, -np.inf, asked)
         if not self._is_possible(before):
             return Gain(np.inf, np.inf, asked)
         assert before.foretold is not None and after.foretold is not None
         size = column_rms(after.foretold)
-        foretold = standard_errors_between(*(mean_squares(model.foretold, size) for model in (before, after)))  # type: ignore
+        foretold = standard_errors_between(*(list((model.foretold / size).T) for model in (before, after)))  # type: ignore
         simulated = standard_errors_better(self.log, self.compare(before), self.compare(after))
         least, most = sorted((foretold, simulated))
         # what is known of the model's own numbers counts, but for what two standard deviations explain
@@ -240,7 +240,8 @@ class EffectSearch:
                 self.check_model(current)
             if better is not None or self._identify(current) not in visited:
                 continue
-            rivals = {name: self._rivals(current, name) for name in current.names}
+            explanation = self._conclude(current, gains)
+            rivals = explanation.rivals
             accepted = [
                 (name, trial)
                 for name in rivals
@@ -249,12 +250,25 @@ class EffectSearch:
             ]
             name, best = max(accepted, key=lambda pair: -pair[1].gain.nats, default=("", None))
             if best is None or self._identify(best.fitted) in visited:
-                return Explanation(current, gains, rivals, self.remainder(current))
+                return explanation
             (other,) = best.added
             self._note(f"take {other} for {name}", best.gain, True, "it is better by the same rule", loss=True)
             if name != other:
                 self._tried[other] = [Trial((name,), current, best.gain)]
             current = best.fitted
+
+    def _conclude(self, current: FittedModel, gains: dict[str, Gain]) -> Explanation:
+        """Fit rivals to what was found, and free functions to what remains."""
+        rivals = {name: self._rivals(current, name) for name in current.names}
+        return Explanation(current, gains, rivals, self.remainder(current))
+
+    def leave_out(self, explanation: Explanation, name: str) -> Explanation:
+        """Explain a log without an effect that was found, and is less likely than something unknown in its place."""
+        current = explanation.fitted
+        less = self._refit(current, {other: numbers for other, numbers in current.numbers.items() if other != name})
+        reason = "something unknown is likelier in its place"
+        self._note(f"leave out {name}", explanation.gains[name], True, reason, loss=True)
+        return self._conclude(*self._reduce(less, thorough=True))
 
     def _begin(self) -> FittedModel:
         """Fit the model as given, with what is known to act and with errors of the recording that are larger than effects

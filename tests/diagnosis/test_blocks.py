@@ -56,13 +56,28 @@ def test_one_factor_on_all_torques_and_the_input_makes_no_model_better(draw_erro
     )
 
 
-def test_blocks_in_which_both_models_err_by_less_than_noise_count_for_nothing():
-    """A drive that stands still for a while: one model leaves exactly nothing there, the other a tenth of the noise."""
-    moving = np.linspace(20.0, 60.0, 13)
-    control, better = np.append(moving, np.zeros(3)), np.append(0.25 * moving, np.full(3, 0.01))
-    assert standard_errors_between(control, better) > 5.0
-    assert standard_errors_between(better, control) < -5.0
-    # few blocks have nearly all of the errors
-    few = np.append(np.full(15, 4.0), 1e6)
-    assert standard_errors_between(few, few / 3.0) > 5.0
-    assert standard_errors_between(np.full(16, np.inf), moving[:1].repeat(16)) == np.inf
+def between(difference, share, noise):
+    """Standard errors for a model that foretells a difference otherwise, of which a share comes true."""
+    return standard_errors_between([share * difference + noise], [(share - 1.0) * difference + noise])
+
+
+def test_what_is_foretold_otherwise_has_to_come_true_by_more_than_half(draw_errors):
+    difference, noise = draw_errors(0.5), draw_errors(1.0)
+    assert between(difference, 1.0, noise) > 4.0 and between(difference, 0.0, noise) < -4.0
+    assert abs(between(difference, 0.5, noise)) < 3.0
+
+
+def test_blocks_in_which_two_models_foretell_the_same_say_nothing(draw_errors):
+    moving, noise = draw_errors(0.5), draw_errors(1.0)
+    moving[:300] = 0.0
+    assert between(moving, 1.0, noise) > 3.5
+    assert between(0.0 * moving, 1.0, noise) == 0.0
+    # and one block that has nearly all of it is one block
+    moving[-100:] *= 1e3
+    assert 0.0 < between(moving, 1.0, noise) < 3.0
+
+
+def test_a_model_that_diverges_is_no_better(draw_errors):
+    finite, infinite = draw_errors(1.0), np.full(1600, np.inf)
+    assert standard_errors_between([infinite], [finite]) == np.inf
+    assert standard_errors_between([finite], [infinite]) == -np.inf

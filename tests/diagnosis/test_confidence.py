@@ -14,17 +14,20 @@ from jaxbl.drive import make_effect
 NAME, RIVAL = "motor.coulomb_friction", "motor.viscous_friction"
 
 
-def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, **numbers):
-    """Return the finding; `rival`: what it gains over another effect; `unknown`: nats that a free function still gains."""
+def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, left=0.0, **numbers):
+    """Return the finding; `rival`: what it gains over another effect; `unknown`: nats that a free function still gains;
+    `left`: torque that is still missing over its own."""
     effect = make_effect(name, torque=0.1, **numbers)
     fitted = SimpleNamespace(
         names=(name,),
         numbers={name: {"torque": 0.1} | numbers},
         experiment=SimpleNamespace(effects=(effect,)),
+        share=lambda name: 0.2,
         errors=lambda: {f"effects.{name}.torque": error} | {f"effects.{name}.{leaf}": 0.1 * error for leaf in numbers},
     )
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
-    (finding,) = weigh(Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {"motor.time": (unknown, 0.1)}))  # type: ignore[arg-type]
+    remainder = {"motor.time": (unknown, 0.1)}
+    (finding,) = weigh(Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, remainder), 0.2 * left)  # type: ignore[arg-type]
     return finding
 
 
@@ -47,12 +50,12 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(length,
 
 def test_what_the_fit_says_counts_only_if_blocks_agree():
     assert weigh_effect((50.0, 4.0)).alternatives == ()
-    # z standard errors are z²/2 nats
-    assert weigh_effect((50.0, 2.0)).confidence == pytest.approx(1.0 / (1.0 + np.exp(-2.0)))
+    # z standard errors are 2 z² nats
+    assert weigh_effect((50.0, 1.0)).confidence == pytest.approx(1.0 / (1.0 + np.exp(-2.0)))
     finding = weigh_effect((50.0, 0.0))
     assert finding.confidence == pytest.approx(0.5) and finding.alternatives == ((RIVAL, pytest.approx(0.5)),)
     # and where they contradict it they count as a normal deviate
-    finding = weigh_effect((50.0, -3.0))
+    finding = weigh_effect((50.0, -1.5))
     assert finding.confidence == pytest.approx(1.0 / (1.0 + np.exp(4.5)), rel=1e-6)
     assert finding.confidence + finding.alternatives[0][1] == pytest.approx(1.0)
     # blocks of one log are no other data than its own fit: a better fit counts once
@@ -65,6 +68,15 @@ def test_an_effect_is_no_surer_than_what_is_unknown_leaves():
     assert weigh_effect(unknown=50.0).confidence == pytest.approx(0.5)
     finding = weigh_effect((50.0, 0.0), unknown=1000.0)
     assert finding.confidence == pytest.approx(1.0 / 402.0) and finding.alternatives == ()
+    assert not finding.is_likely
+
+
+def test_an_effect_smaller_than_the_torque_that_is_left_is_not_likely():
+    assert weigh_effect(left=0.1).confidence == pytest.approx(1.0 / 1.01)
+    assert not weigh_effect(left=1.1).is_likely
+    # two that the log does not part are likely together
+    tied = weigh_effect((50.0, 0.0), left=0.2)
+    assert tied.confidence < 0.5 and tied.is_likely
 
 
 def test_the_explained_share_is_that_of_the_torques_power_beyond_noise():
