@@ -6,7 +6,8 @@ missing torque (:mod:`.torque_regression`), there also several together. Each is
 is asked for again: an effect stays if the model without it, or with its special case in its place, is worse by the same
 rule. In the end what was passed by is tried in the place of what is there: rivals, other waves, and effects where numbers
 were taken to be off. Then free functions of time, position and velocity are fitted to what remains: one that gains
-clearly says that something else is missing.
+clearly says that something else is missing. What is less likely than something unknown in its place goes again
+(:mod:`.choice`).
 """
 
 import dataclasses
@@ -55,7 +56,8 @@ class Gain(NamedTuple):
         nats: of log-evidence on the log.
         standard_errors: by which it predicts blocks of the log better, by numbers fitted without them: in prediction errors,
             or in windows and torques, unless the other ones surely contradict.
-        asked: standard errors that make up for its odds before the log is seen: z standard errors are z²/2 nats.
+        asked: standard errors that make up for its odds before the log is seen: of a model that is right, z standard errors
+            are 2 z² nats over one that is not (:func:`.blocks.standard_errors_between`).
     """
 
     nats: float
@@ -69,7 +71,7 @@ class Gain(NamedTuple):
 
     @property
     def worth(self) -> float:
-        """Nats as far as the blocks agree, whose z standard errors are z²/2 nats."""
+        """Nats as far as the blocks agree, whose z standard errors are 2 z² nats."""
         by_blocks = 2.0 * self.standard_errors * abs(self.standard_errors)
         agreed = min(self.nats, by_blocks, key=abs) if self.nats * by_blocks > 0.0 else by_blocks
         return float(np.clip(agreed, -700.0, 700.0))
@@ -218,12 +220,15 @@ class EffectSearch:
                 explanation = by_effects
             else:
                 self.fits = self.rough
+        self._note_remainder(explanation)
+        return explanation
+
+    def _note_remainder(self, explanation: Explanation) -> None:
         remaining = explanation.largest_gain
         self._note(
             "fit free functions to what remains", Gain(remaining, np.nan), bool(remaining > LIMITS.unknown),
             f"a free function still gains {remaining:.3g} nats; {LIMITS.unknown:g} show something unknown",
         )  # fmt: skip
-        return explanation
 
     def _explain(self, current: FittedModel) -> Explanation:
         """Add, replace and take out effects until nothing is accepted."""
@@ -268,7 +273,9 @@ class EffectSearch:
         less = self._refit(current, {other: numbers for other, numbers in current.numbers.items() if other != name})
         reason = "something unknown is likelier in its place"
         self._note(f"leave out {name}", explanation.gains[name], True, reason, loss=True)
-        return self._conclude(*self._reduce(less, thorough=True))
+        explanation = self._conclude(*self._reduce(less, thorough=True))
+        self._note_remainder(explanation)
+        return explanation
 
     def _begin(self) -> FittedModel:
         """Fit the model as given, with what is known to act and with errors of the recording that are larger than effects
