@@ -33,7 +33,7 @@ def unfelt(recorded: Sequence[np.ndarray], smooth: Sequence[np.ndarray]) -> tupl
     slow, does not matter.
 
     Args:
-        given, smooth: errors under the input as recorded and smoothed, part by part, rad; shape (samples, sides).
+        recorded, smooth: errors under the input as recorded and smoothed, part by part, rad; shape (samples, sides).
     """
     spectrum = spectrum_of(recorded)
     pairs = [np.stack([errors, errors - other], axis=2) for errors, other in zip(recorded, smooth, strict=True)]

@@ -169,7 +169,7 @@ class ReferenceLog:
         """Errors of a model at this log's period on short windows, and the torques that it lacks.
 
         Args:
-            whole: the model.
+            experiment: the model.
             models: one for each part of the log (:func:`parts_of_blocks`), such as ones whose numbers were fitted without
                 it, whose errors there are taken in place of the model's.
         """

@@ -103,7 +103,7 @@ class ModelFits:
 
         Args:
             numbers: of the effects, to begin with.
-            own: theta of the model's own numbers, to begin with.
+            theta: of the model's own numbers, to begin with.
             begin: a model nearby, whose initial states are begun with.
             new: effects that it has not.
             promise: nats that these may gain: if a fit gains less than half, another begins at none of them, as the way

@@ -91,7 +91,7 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
     Args:
         out: the folder.
         parts: of the page, by name: each has a script in `page/`, and the first one elements.
-        about: what it says, as plain data.
+        content: what it says, as plain data.
         scripts: whether it can be opened from disk.
     """
     points = out / "points.parquet"
