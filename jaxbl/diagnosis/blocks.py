@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbl.records.least_squares import rms
+from jaxbl.records.least_squares import as_normal, rms
 
 from .reference_log import BLOCKS, Comparison, ReferenceLog
 from .thresholds import LIMITS
@@ -30,14 +30,14 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
     scales = [{name: comparison.gain if name.startswith("torque") else 1.0 for name in channels} for comparison in pair]
     floors = [log.noise_floor(comparison.torques) for comparison in pair]
     noise = {name: np.sqrt(np.prod([floors[i][name] / scales[i][name] for i in range(2)])) for name in channels}
-    errors, after = (
+    before, after = (
         [comparison.samples[name].ravel() / (scale[name] * noise[name]) for name in channels]
         for comparison, scale in zip(pair, scales, strict=True)
     )
-    sizes = [np.sqrt(max(rms(one), 1.0) * max(rms(other), 1.0)) for one, other in zip(errors, after, strict=True)]
-    errors, after = ([one / size for one, size in zip(side, sizes, strict=True)] for side in (errors, after))
-    together = standard_errors_between(errors, after)
-    by_channel = [standard_errors_between([one], [other]) for one, other in zip(errors, after, strict=True)]
+    sizes = [np.sqrt(max(rms(old), 1.0) * max(rms(new), 1.0)) for old, new in zip(before, after, strict=True)]
+    before, after = ([errors / size for errors, size in zip(side, sizes, strict=True)] for side in (before, after))
+    together = standard_errors_between(before, after)
+    by_channel = [standard_errors_between([old], [new]) for old, new in zip(before, after, strict=True)]
     return max(together, *by_channel) if -min(by_channel) < LIMITS.difference < max(by_channel) else together
 
 
@@ -57,9 +57,9 @@ def standard_errors_between(control: Sequence[np.ndarray], model: Sequence[np.nd
         return -np.inf if all(np.isfinite(errors).all() for errors in control) else np.inf
     agreed, apart = np.zeros(BLOCKS), np.zeros(BLOCKS)
     for before, after in zip(control, model, strict=True):
-        for i, (one, other) in enumerate(zip(*(np.array_split(x, BLOCKS) for x in (before, after)), strict=True)):
-            agreed[i] += 0.5 * (np.mean(one**2) - np.mean(other**2))
-            apart[i] += np.mean((one - other) ** 2)
+        for i, (old, new) in enumerate(zip(*(np.array_split(x, BLOCKS) for x in (before, after)), strict=True)):
+            agreed[i] += 0.5 * (np.mean(old**2) - np.mean(new**2))
+            apart[i] += np.mean((old - new) ** 2)
     total = np.sum(apart)
     if not total > 0.0:
         return 0.0
@@ -68,7 +68,4 @@ def standard_errors_between(control: Sequence[np.ndarray], model: Sequence[np.nd
     freedom = max(total**2 / np.sum(apart**2) - 1.0, 0.5)
     scatter = np.sqrt(np.sum((agreed - share * apart) ** 2) * (freedom + 1.0) / freedom) / total
     floor = LIMITS.noise_structure * sum(np.mean(np.square(errors)) + 1.0 for errors in model) * BLOCKS / total
-    t = share / np.hypot(scatter, floor)
-    # Student's t as a normal number (D. Wallace, Annals of Mathematical Statistics 30, 1959)
-    size = (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0) * np.sqrt(freedom * np.log1p(t**2 / freedom))
-    return float(np.sign(t) * size)
+    return float(as_normal(share / np.hypot(scatter, floor), freedom))

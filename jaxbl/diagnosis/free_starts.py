@@ -63,12 +63,12 @@ def best_runs(
         windows, within = windows.only(indices), within[indices]
     if not len(within):
         return Run(windows.finer, start, np.zeros(len(experiment.sides)))
-    seen = count_seen(windows.torque.shape[1])
-    found = seek_starts(experiment, windows, passes, at_rest, seen, within)
-    (first, size), rest = over_size(found.slope[:, :seen]), found.slope[:, seen:]
-    inverse = np.linalg.pinv(np.where(np.isfinite(first), first, 0.0), rcond=_RANK)
-    change = (inverse @ found.residual[:, :seen].reshape(len(first), -1, 1))[:, :, 0] / size
-    left = found.residual - np.einsum("wrsn,wn->wrs", found.slope, change)
-    unit = rest / size[:, None, None]
+    first = count_seen(windows.torque.shape[1])
+    starts = seek_starts(experiment, windows, passes, at_rest, first, within)
+    (columns, size), later = over_size(starts.slope[:, :first]), starts.slope[:, first:]
+    inverse = np.linalg.pinv(np.where(np.isfinite(columns), columns, 0.0), rcond=_RANK)
+    change = (inverse @ starts.residual[:, :first].reshape(len(columns), -1, 1))[:, :, 0] / size
+    left = starts.residual - np.einsum("wrsn,wn->wrs", starts.slope, change)
+    unit = later / size[:, None, None]
     spread = np.einsum("wrsn,wnm,wrsm->wrs", unit, inverse @ inverse.swapaxes(1, 2), unit)
-    return Run(left, found.states, np.sqrt(np.mean(spread, axis=(0, 1))))
+    return Run(left, starts.states, np.sqrt(np.mean(spread, axis=(0, 1))))

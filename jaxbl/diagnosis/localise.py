@@ -18,7 +18,7 @@ from jaxbl.chain import Experiment
 from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.regression import Kinematics, balance
 from jaxbl.estimation.segments import Segment
-from jaxbl.records.least_squares import rms
+from jaxbl.records.least_squares import as_normal, rms
 
 from .coordinates import CoordinateValues
 from .residuals import Residual, SideResiduals, narrow, noise_spectrum
@@ -306,9 +306,7 @@ def _mean_error(
     by_scatter = np.where(enough, by_scatter, np.maximum(by_scatter, np.sqrt(square)))
     error = np.maximum(np.maximum(by_noise, by_scatter), np.finfo(float).tiny)
     t = mean / error
-    # Wallace: Student's t as a normal number
-    normal = np.sign(t) * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0) * np.sqrt(freedom * np.log1p(t**2 / freedom))
-    return error, np.where(by_noise >= by_scatter, t, normal)
+    return error, np.where(by_noise >= by_scatter, t, as_normal(t, freedom))
 
 
 def _sums(torque: np.ndarray, row: np.ndarray, rows: int, index: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:

@@ -134,9 +134,9 @@ def _differentiate(
 ) -> np.ndarray:
     """Derivative of the residuals by theta and the initial states, shape (windows, samples, sides, parameters + states)."""
     slopes = []
-    each = max(_AT_ONCE // windows.torque.shape[1], 1)
-    for first in range(0, len(windows.time), each):
-        part = np.arange(first, min(first + each, len(windows.time)))
+    most = max(_AT_ONCE // windows.torque.shape[1], 1)
+    for first in range(0, len(windows.time), most):
+        part = np.arange(first, min(first + most, len(windows.time)))
         piece = jax.tree.map(lambda leaf, part=part: leaf[part], states)
         slopes.append(_differentiate_some(experiment, free, theta, windows.only(part), piece))
     return np.concatenate(slopes)
@@ -192,7 +192,7 @@ def seek_starts(
     windows: Windows,
     passes: int,
     at_rest: bool,
-    seen: int | None = None,
+    fitted_samples: int | None = None,
     known_before: np.ndarray | bool = False,
 ) -> Starts:
     """Seek the initial states of windows by damped Gauss-Newton.
@@ -204,7 +204,7 @@ def seek_starts(
         windows: with a guess.
         passes: initial states that are tried for a window at most.
         at_rest: whether standstill is one of them.
-        seen: samples of a window that they are fitted to; all if left out.
+        fitted_samples: of a window that they are fitted to; all if left out.
         known_before: whether what was before a window is known, so that an effect's state follows; shape (windows,).
     """
     leaves, shape = jax.tree.flatten(windows.start)
@@ -217,8 +217,8 @@ def seek_starts(
     fitted[np.ix_(np.flatnonzero(windows.at_rest), moving)] = 0.0
     for effect, state in zip(experiment.effects, places.effects, strict=True):
         # others follow from numbers that are still to be found
-        known = effect.state_from_input | (known_before & effect.state_from_measurement)
-        fitted[np.ix_(np.flatnonzero(np.broadcast_to(known, runs)), jax.tree.leaves(state))] = 0.0
+        is_known = effect.state_from_input | (known_before & effect.state_from_measurement)
+        fitted[np.ix_(np.flatnonzero(np.broadcast_to(is_known, runs)), jax.tree.leaves(state))] = 0.0
     residual = np.zeros((runs, samples, len(moving)))
     slope, states = np.zeros((*residual.shape, count)), [np.zeros((runs, samples)) for _ in leaves]
     following, going = best.copy(), np.ones(runs, bool)
@@ -233,7 +233,7 @@ def seek_starts(
         part = windows.only(indices)
         along = simulate_windows(experiment, part, shape.unflatten(list(following[indices].T)))
         value = _leave(experiment, part, along)
-        squares = np.sum(value[:, :seen] ** 2, axis=(1, 2))
+        squares = np.sum(value[:, :fitted_samples] ** 2, axis=(1, 2))
         better = (squares < cost[indices]) | ~np.isfinite(cost[indices])
         damping[indices] = np.where(
             better, np.maximum(0.01 * damping[indices], RIDGE), np.maximum(30.0 * damping[indices], 1e-2)
@@ -244,8 +244,8 @@ def seek_starts(
             for stored, leaf in zip(states, jax.tree.leaves(along), strict=True):
                 stored[new] = leaf
             slope[new] = _differentiate(experiment, (), np.empty(0), part.only(better), along) * fitted[new][:, None, None]
-        unit, size = over_size(slope[indices][:, :seen])
-        towards = unit.swapaxes(1, 2) @ residual[indices][:, :seen].reshape(len(indices), -1, 1)
+        unit, size = over_size(slope[indices][:, :fitted_samples])
+        towards = unit.swapaxes(1, 2) @ residual[indices][:, :fitted_samples].reshape(len(indices), -1, 1)
         matrix = unit.swapaxes(1, 2) @ unit + damping[indices][:, None, None] * np.eye(count)
         change = np.linalg.solve(matrix, towards)
         following[indices] = best[indices] - change[:, :, 0] / size
@@ -288,8 +288,8 @@ def projected_residual(
 
     Of each window's initial state `passes` values are tried, with `at_rest` standstill among them.
     """
-    found = seek_starts(experiment, windows, passes, at_rest)
-    return _without(_basis(found.slope), found.residual), jax.tree.map(lambda leaf: leaf[:, 0], found.states)
+    starts = seek_starts(experiment, windows, passes, at_rest)
+    return _without(_basis(starts.slope), starts.residual), jax.tree.map(lambda leaf: leaf[:, 0], starts.states)
 
 
 class _Point(NamedTuple):
@@ -354,12 +354,12 @@ def fit(
         # through zero, so that what is 0 is found without bias
         numbers = {number.path: number._replace(minimum=None).value(x) for number, x in zip(free, theta, strict=True)}
         model = set_leaves(experiment, jax.tree.map(np.asarray, numbers))
-        found = seek_starts(model, replace(windows, start=start), passes, at_rest)
-        basis = _basis(found.slope)
-        residual = _without(basis, found.residual)
+        starts = seek_starts(model, replace(windows, start=start), passes, at_rest)
+        basis = _basis(starts.slope)
+        residual = _without(basis, starts.residual)
         squares = float(np.sum(residual**2) + np.sum(precision * (moving * theta) ** 2))
-        best = replace(windows, start=jax.tree.map(lambda leaf: leaf[:, 0], found.states))
-        return _Point(theta, model, best, basis, found.states, residual, squares if np.isfinite(squares) else np.inf)
+        best = replace(windows, start=jax.tree.map(lambda leaf: leaf[:, 0], starts.states))
+        return _Point(theta, model, best, basis, starts.states, residual, squares if np.isfinite(squares) else np.inf)
 
     best, converged = None, False
     for turn in range(rounds + 1):
