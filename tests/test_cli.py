@@ -493,7 +493,7 @@ def test_tune_leaves_gains_numbers_figures_and_report(call, tmp_path, monkeypatc
     code, lines, _ = call("tune", "study.toml")
     folder = tmp_path / "results" / "study_gains"
     assert code == 0
-    figures = {f"figures/{name}.png" for name in ("tuning_motor", "limits_motor")}
+    figures = {"figures/tuning_motor.png"}
     assert {"gains.toml", "tuning.json", "report.html", "manifest.json"} | figures <= set(list_files(folder))
     assert "λ = " in lines[0] and "α = " in lines[0] and len(lines) <= 8
     assert re.search(r"Compiled in [\d.]+ s, ran 26 lanes in [\d.]+ s\.", (folder / "report.html").read_text())

@@ -1,8 +1,8 @@
-"""The error (33)-(34) of an observer in its phase plane: slope, peaks, worst path, majorant of the proof (Fig. 29)."""
+"""The error (33)-(34) of an observer in its phase plane: slope, peaks, majorant of the proof (Fig. 29)."""
 
 import numpy as np
 
-from jaxbl.observer.conditions import arc_integral, least_lambda_davila_fridman
+from jaxbl.observer.conditions import least_lambda_davila_fridman
 from jaxbl.sweeps.elementwise import call_in_float64
 
 
@@ -50,26 +50,3 @@ def majorant(peak: float, lambda_: float, alpha: float, f_plus: float) -> tuple[
     e, slope = np.r_[along * (2.0 - along), 1.0, 0.0], np.r_[1.0 - along, -ratio, -ratio]
     largest = peak**2 / (2.0 * (alpha - f_plus)) * np.sign(peak)
     return largest * np.r_[e, -(ratio**2) * e], peak * np.r_[slope, -ratio * slope]
-
-
-def worst_half_cycle(lambda_: float, alpha: float, f_plus: float, points: int = 1001) -> tuple[np.ndarray, np.ndarray]:
-    """The outermost path of (34) from e = 0 with slope 1 rad/s to e = 0 again: e (rad) and its slope (rad/s).
-
-    With y = sqrt(e) and a slope of p y, y sqrt(p^2 + lambda p + c) falls by exp(-(lambda / 2) arc)
-    (docs/theory_appendix.md); c is 2 (alpha - f) on the way out and 2 (alpha + f) on the way back. It ends with the ratio of
-    :func:`jaxbl.observer.conditions.peak_ratio`. Needs alpha > f.
-    """
-    half, size, es, slopes = 0.5 * lambda_, 1.0, [], []
-    c1, c2 = 2.0 * (alpha - f_plus), 2.0 * (alpha + f_plus)
-    # out and back, by the angle of p
-    for c, first, last in ((c1, 0.5 * np.pi, 0.0), (c2, 0.0, -0.5 * np.pi)):
-        angle = np.linspace(first, last, points)
-        sine, cosine = np.sin(angle), np.cos(angle)
-        arc = call_in_float64(arc_integral, sine + half * cosine, cosine, c - half**2)
-        # the first point out has an arc of zero; where the arc is endless, the path has ended at the origin
-        level = size * np.exp(-half * (arc - arc[0]))
-        form = np.where(level > 0.0, sine**2 + lambda_ * sine * cosine + c * cosine**2, 1.0)
-        es.append((level * cosine) ** 2 / form)
-        slopes.append(level * sine / np.sqrt(form))
-        size = level[-1] * np.sqrt(c2 / c1)
-    return np.concatenate(es), np.concatenate(slopes)

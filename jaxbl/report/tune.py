@@ -4,7 +4,6 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
-from pandas import DataFrame
 
 from jaxbl.files import write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
@@ -20,25 +19,20 @@ from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usu
 from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
 from .panels import (
-    BLUE,
     MARKERS,
-    Axis,
     Figure,
-    Line,
     Map,
     Panel,
     Part,
-    Span,
     literal,
     mark,
-    stretches,
     with_unit,
 )
 
 
 def draw_tuning(tuning: Tuning) -> list[Figure]:
     """All figures of a tuning."""
-    return [draw(tuning, side) for draw in (_map, _limits) for side in tuning.config.sides if side in tuning.candidates]
+    return [_map(tuning, side) for side in tuning.config.sides if side in tuning.candidates]
 
 
 def error_label(summary: JsonObject) -> str:
@@ -84,16 +78,6 @@ def _map(tuning: Tuning, side: str) -> Figure:
     return Figure(f"tuning_{side}", [panel], caption, width=6.4, height=4.8)
 
 
-_LIMITS = {"converged": "#7F7F7F", "margin_alpha": "#3F51B5", "margin_exact": "#E8000B", "longest_convergence": "#8B4513"}
-"""Colours of constraints."""
-
-
-def _with_limit(name: str, constraint: JsonObject) -> str:
-    """A constraint with its limit, and whether it binds."""
-    limit = f" = {constraint['limit']:g}" if "limit" in constraint else ""
-    return f"{name}{limit}{' (binds)' if constraint['binds'] else ''}"
-
-
 def _missing(names: list[str]) -> str:
     """Say what gains do that miss constraints."""
     margins = " and ".join(name for name in names if name != "converged")
@@ -101,47 +85,7 @@ def _missing(names: list[str]) -> str:
     return " and ".join([*parts, "does not converge"] if "converged" in names else parts)
 
 
-def _limits(tuning: Tuning, side: str) -> Figure:
-    """The error along each gain through the optimum, and what ends the way to each side."""
-    summary, bound = tuning.summary, tuning.summary["f_plus"][side]
-    limits, gains, objective = summary["limits"][side], summary["gains"][side], summary["objective"]
-    error, label, panels = summary["achieved"][side][f"{objective}_rmse"], f"worst {error_label(summary)}", []
-    for gain, symbol, unit, ratio_label, ratio in _PLANES:
-        line, parts = DataFrame(limits["profiles"][gain]), list[Part]()
-        x, y = (line[name].to_numpy(float) for name in (gain, "error"))
-        edges = cell_edges(x, True)
-        for name, constraint in limits["constraints"].items():
-            look = f"not met: {_with_limit(name, constraint)}", _LIMITS[name], "x", 0.4 if constraint["binds"] else 0.15
-            missed = line["missed"].map(lambda names, name=name: name in names)
-            parts += [Span(edges[first], edges[last], *look) for first, last in stretches(missed)]
-        parts.append(Line(x, y, label, BLUE, 2.0))
-        parts.append(Span(gains[gain], gains[gain], width=0.8, dashes="-"))
-        parts.append(mark(gains[gain], error, "tuned", held=False))
-        smaller, larger = (_short(limit) for limit in limits["towards"][gain].values())
-        ends = float(edges[0]), float(edges[-1])
-        axis = Axis(f"{symbol} ({unit})", log=True, ends=ends, ratio=(float(ratio(bound)), ratio_label))
-        title = f"smaller {symbol}: {smaller}\nlarger {symbol}: {larger}"
-        panels.append(Panel(axis, Axis(label, log=True), parts, title))
-    caption = (
-        f"{side}: what limits the gains: the error along each of them, with the other one as tuned, from the runs of all "
-        "maps (between two rows of a map, interpolated)."
-    )
-    return Figure(f"limits_{side}", panels, caption, 2)
-
-
-_PLANES = (
-    ("lambda", "λ", "√rad/s", "λ / √f⁺", np.sqrt),
-    ("alpha", "α", "rad/s²", "α / f⁺", float),
-)
-
-
-def _short(way: JsonObject) -> str:
-    """Say what limits a gain towards one side, in few words."""
-    if way["limit"] == "constraint":
-        return " and ".join(way["missed"])
-    if way["limit"] == "range":
-        return "end of the range"
-    return "diverges" if way["change"] is None else f"error {_size(way['change'])}"
+_GAINS = ("lambda", "λ", "√rad/s"), ("alpha", "α", "rad/s²")
 
 
 def _size(change: float) -> str:
@@ -251,17 +195,7 @@ def gains_toml(summary: JsonObject) -> str:
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.',
     ]
     for side, gains in summary["gains"].items():
-        achieved = summary["achieved"][side]
-        lines += [
-            "",
-            f"# f+ = {summary['f_plus'][side]:.4g} rad/s^2. Reached, the worst of all runs: velocity error "
-            f"{achieved['velocity_rmse']:.3g} rad/s rms,",
-            f"# torque error {achieved['torque_rmse']:.3g} N m rms, converged after {achieved['convergence_time']:.3g} s; "
-            f"margins {achieved['margin_alpha']:.3g} (alpha), {achieved['margin_exact']:.3g} (exact).",
-            f"[observer.{side}]",
-            f"lambda = {gains['lambda']!r}",
-            f"alpha = {gains['alpha']!r}",
-        ]
+        lines += ["", f"[observer.{side}]", f"lambda = {gains['lambda']!r}", f"alpha = {gains['alpha']!r}"]
     return "\n".join(lines) + "\n"
 
 
@@ -320,7 +254,7 @@ def _gains_table(summary: JsonObject) -> ResultTable:
         [f"{side}: {symbol} ({unit})", gains[gain], gains[f"{gain}_ratio"],
          *(_way(symbol, unit, limit) for limit in summary["limits"][side]["towards"][gain].values())]
         for side, gains in summary["gains"].items()
-        for gain, symbol, unit, *_ in _PLANES
+        for gain, symbol, unit in _GAINS
     ]  # fmt: skip
     return ResultTable("Gains", ["gain", "value", "over f⁺, λ over √f⁺", "a smaller one", "a larger one"], rows)
 

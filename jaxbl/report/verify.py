@@ -1,4 +1,4 @@
-"""What `jaxbl verify` leaves to be read: maps of the error system and of the drive, counterexamples, tables."""
+"""What `jaxbl verify` leaves to be read: the map of the error system, counterexamples, tables."""
 
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
@@ -8,7 +8,6 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from pandas import DataFrame, Series
 
 from jaxbl.gains.error_system import list_conditions
 from jaxbl.gains.verify import Verdict, sides_with_gain_axes
@@ -17,21 +16,18 @@ from jaxbl.lines import Lines
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .error_plane import draw_worst_planes
-from .gain_plane import EXACT, condition_curves, conditions_line, usual_rule_curve
+from .gain_plane import condition_curves, conditions_line
 from .loop_gains import margin_table
 from .maps import cell_edges
-from .panels import BLUE, MARKERS, VERMILION, Axis, Figure, Line, Map, Panel, Part, Scale, cloud, literal, mark
+from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mark
 
 _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
-_ALPHA, _LAMBDA = "α / f⁺", "λ / √f⁺"
 
 
 def draw_verdict(verdict: Verdict) -> list[Figure]:
-    """All figures of a verification."""
-    levels = itertools.chain(*(_levels(verdict, side) for side in sides_with_gain_axes(verdict.config)))
-    return [_atlas(verdict), *draw_worst_planes(verdict.summary["marks"]), *levels]
+    """The atlas; the runs of the drive are for `jaxbl explore`."""
+    return [_atlas(verdict)]
 
 
 def _mark_gains(verdict: Verdict) -> list[Line]:
@@ -57,48 +53,9 @@ def _atlas(verdict: Verdict) -> Figure:
         f"Simulated ratio of successive velocity peaks over {plane.ratio.size} cells; every condition demands a λ above its "
         "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
-    pairs = ((_ALPHA, plane.alpha), (_LAMBDA, plane.lambda_))
+    pairs = (("α / f⁺", plane.alpha), ("λ / √f⁺", plane.lambda_))
     axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in pairs)
     return Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
-
-
-def _normalise(frame: DataFrame, side: str) -> tuple[Series, Series]:
-    """Gains of runs in units of each run's own true f_plus."""
-    bound = frame[f"{side}.f_plus"]
-    return frame[f"observer.{side}.alpha"] / bound, frame[f"observer.{side}.lambda"] / np.sqrt(bound)
-
-
-def _levels(verdict: Verdict, side: str) -> list[Figure]:
-    """The runs that converged and that failed, over the gains in units of each run's own true f_plus; nothing where no run
-    has a finite one, and a λ above 0."""
-    wrong, places = verdict.counterexamples, {}
-    if len(wrong):
-        wrong = wrong[(wrong["side"] == side) & (wrong["bound"] == "true") & (wrong["condition"] == "exact")]
-    for level, frame in verdict.levels.items():
-        gains = np.stack(_normalise(frame, side), axis=1)
-        there = np.isfinite(gains).all(axis=1) & (gains > 0.0).all(axis=1)
-        places[level] = gains[there], frame[f"{side}.converged"].to_numpy(bool)[there]
-    ends = np.concatenate([gains for gains, _ in places.values()])
-    if not len(ends):
-        return []
-    (left, low), (right, high) = ends.min(axis=0) / 1.2, 1.2 * ends.max(axis=0)
-    alphas, panels = (max(left, 1.0001), max(right, 1.001)), []
-    for level, (gains, converged) in places.items():
-        parts: list[Part] = [
-            cloud(*gains[rows].T, name, colour, marker=marker, size=size, opacity=0.7)
-            for rows, marker, colour, name, size in (
-                (converged, "o", BLUE, "converged", 3.0), (~converged, "x", VERMILION, "failed", 4.0)
-            )
-        ]  # fmt: skip
-        parts += [*condition_curves(EXACT, 1.0, alphas), usual_rule_curve(1.0, alphas)]
-        failures = sum(wrong["level"] == level) if len(wrong) else 0
-        axes = (Axis(_ALPHA, log=True, ends=(left, right)), Axis(_LAMBDA, log=True, ends=(low, high)))
-        panels.append(Panel(*axes, parts, f"{_LEVELS[level]}\n{failures} failed though ρ < 1"))
-    caption = (
-        f"Runs of the drive, {side} observer, each in units of its own true f⁺, on the axes of the atlas. A real input is "
-        "not the worst disturbance: runs converge below the curves as well."
-    )
-    return [Figure(f"levels_{side}", panels, caption, len(panels), 4.4 * len(panels), 4.2)]
 
 
 def _name(level: JsonObject) -> str:
@@ -152,7 +109,7 @@ def describe_verdict(verdict: Verdict) -> Result:
     if margins := verdict.summary["loop_margins"]:
         tables.append(margin_table(margins))
     remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own_gains.items()]
-    remarks += [*map(_mark_line, marks), *_level_lines(verdict)]
+    remarks += _level_lines(verdict)
     title = verdict.config.title or "Gain conditions"
     return Result(title, word, headline, figures, remarks, verdict.config.notes, tables)
 
@@ -168,33 +125,18 @@ def _judge_own_gains(verdict: Verdict) -> JsonObject:
 
 
 def _level_lines(verdict: Verdict) -> Lines:
-    """Say which conditions have counterexamples on each level, and why runs converge where none can hold."""
-    lines, levels = [], verdict.summary["levels"]
-    for level in levels:
+    """Say where the observer failed although a condition held, and why."""
+    lines = []
+    for level in verdict.summary["levels"]:
         wrong = [entry for entry in level["conditions"] if entry["counterexamples"]]
-        kind = "cells" if level.get("side") is None else "runs"
-        line = f"{_name(level)}: {level['cells']} {kind}, of which {level['converged']} converge, "
-        if not wrong:
-            line += "with no counterexample to any condition."
-        else:
+        if wrong:
             counts = ", ".join(f"{entry['title']} {entry['counterexamples']} of {entry['holds']}" for entry in wrong)
             causes = list(level["causes"].get("true", {}).items())[:4]
-            line += f"and the observer failed although a condition held: {counts}. Causes, by experiment: "
-            line += ", ".join(f"{cause} ({count})" for cause, count in causes) + "."
-        lines.append(line)
+            text = ", ".join(f"{cause} ({count})" for cause, count in causes)
+            lines.append(
+                f"{_name(level)}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}."
+            )
     return lines
-
-
-def _mark_line(gains: JsonObject) -> str:
-    """Say whether marked gains are safe, and what they did here."""
-    rho = gains["peak_ratio"]
-    if gains["alpha_ratio"] is None:
-        return f"{gains['name']}: the run diverged."
-    here = f"it converged here after {gains['convergence_time']:.3g} s" if gains["converged"] else "it did not converge here"
-    if rho is None:
-        return f"{gains['name']}: not safe, as α is below the true f⁺ (α / f⁺ = {gains['alpha_ratio']:.3g}); {here}."
-    judged = "safe: any disturbance within f⁺ dies out" if rho < 1.0 else "not safe: the worst disturbance upholds the error"
-    return f"{gains['name']}: {judged} (ratio of successive peaks ρ = {rho:.3g}); {here}."
 
 
 def _level_table(level: JsonObject) -> ResultTable:

@@ -4,8 +4,32 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant, worst_half_cycle
-from jaxbl.observer.conditions import least_lambda_davila_fridman, peak_ratio
+from jaxbl.gains.phase_plane import error_peaks, error_slope, majorant
+from jaxbl.observer.conditions import arc_integral, least_lambda_davila_fridman, peak_ratio
+from jaxbl.sweeps.elementwise import call_in_float64
+
+
+def worst_half_cycle(lambda_: float, alpha: float, f_plus: float, points: int = 1001) -> tuple[np.ndarray, np.ndarray]:
+    """The outermost path of (34) from e = 0 with slope 1 rad/s to e = 0 again: e (rad) and its slope (rad/s).
+
+    With y = sqrt(e) and a slope of p y, y sqrt(p^2 + lambda p + c) falls by exp(-(lambda / 2) arc)
+    (docs/theory_appendix.md); c is 2 (alpha - f) on the way out and 2 (alpha + f) on the way back. It ends with the ratio of
+    :func:`jaxbl.observer.conditions.peak_ratio`. Needs alpha > f.
+    """
+    half, size, es, slopes = 0.5 * lambda_, 1.0, [], []
+    c1, c2 = 2.0 * (alpha - f_plus), 2.0 * (alpha + f_plus)
+    # out and back, by the angle of p
+    for c, first, last in ((c1, 0.5 * np.pi, 0.0), (c2, 0.0, -0.5 * np.pi)):
+        angle = np.linspace(first, last, points)
+        sine, cosine = np.sin(angle), np.cos(angle)
+        arc = call_in_float64(arc_integral, sine + half * cosine, cosine, c - half**2)
+        # the first point out has an arc of zero; where the arc is endless, the path has ended at the origin
+        level = size * np.exp(-half * (arc - arc[0]))
+        form = np.where(level > 0.0, sine**2 + lambda_ * sine * cosine + c * cosine**2, 1.0)
+        es.append((level * cosine) ** 2 / form)
+        slopes.append(level * sine / np.sqrt(form))
+        size = level[-1] * np.sqrt(c2 / c1)
+    return np.concatenate(es), np.concatenate(slopes)
 
 
 def test_peaks_of_a_damped_error_and_none_of_its_chatter():

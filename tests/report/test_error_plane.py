@@ -5,7 +5,7 @@ import pytest
 from panel_parts import names_of
 from small_study import small_study
 
-from jaxbl.report.error_plane import draw_worst_planes, error_plane
+from jaxbl.report.error_plane import error_plane
 from jaxbl.sweeps.trial import run
 
 
@@ -37,13 +37,6 @@ def test_why_there_is_no_majorant_is_said(changes, sentence):
     trial = run(small_study({"observer.motor": gains, "run.duration": 1.0}))
     (drawing,) = error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])
     assert drawing.caption.endswith(sentence) and names_of(drawing.panels[0]) == ["error"]
-
-
-def test_marked_gains_whose_alpha_is_too_small_have_no_plane():
-    mark = {"name": "a", "lambda_ratio": 1.0, "alpha_ratio": 2.0, "peak_ratio": 0.7}
-    assert draw_worst_planes([mark | {"alpha_ratio": 0.9, "peak_ratio": None}, mark | {"alpha_ratio": None}]) == []
-    (drawing,) = draw_worst_planes([mark] * 4)
-    assert [panel.title for panel in drawing.panels] == ["a"] * 4
 
 
 def test_an_error_that_noise_tangles_has_no_figure():
