@@ -1,6 +1,6 @@
 """Medians, means and extremes of a study's runs by groups, in memory that does not grow with the number of runs.
 
-Few rows are kept; many are read part by part as often as is needed. Medians and quantiles are exact either way: many values
+Few rows are kept; many are read part by part as often as is needed. Medians are exact either way: many values
 are sorted in a file.
 """
 
@@ -84,12 +84,11 @@ class Distinct:
 
 
 class Spread(NamedTuple):
-    """Numbers of each group, NaN left out: count, least, largest `(groups,)` and quantiles `(quantiles, groups)`."""
+    """Numbers of each group `(groups,)`, NaN left out."""
 
-    count: Array
     least: Array
+    median: Array
     largest: Array
-    quantiles: Array
 
 
 def _read_columns(rows: Iterable[DataFrame], columns: Iterable[str]) -> Iterable[DataFrame]:
@@ -128,24 +127,16 @@ class Groups:
         if not self._keys:
             self.index: pd.Index = pd.RangeIndex(1)
             return
-        groups = distinct.frame().sort_values(self._keys, ignore_index=True)
-        self.index = pd.MultiIndex.from_frame(groups) if len(self._keys) > 1 else pd.Index(groups[self._keys[0]])
-        self._values = [pd.Index(np.sort(groups[key].unique())) for key in self._keys]
-        self._numbers = self._number(groups)
+        self.index = distinct.frame().sort_values(self._keys).set_index(self._keys).index
 
     def __len__(self) -> int:
         return len(self.index)
 
-    def _number(self, frame: DataFrame) -> Array:
-        """One number for the keys of each row, growing as they are sorted."""
-        number = np.zeros(len(frame), np.int64)
-        for key, values in zip(self._keys, self._values, strict=True):
-            number = number * len(values) + values.get_indexer(frame[key])
-        return number
-
     def of(self, frame: DataFrame) -> Array:
         """The group of each row."""
-        return np.searchsorted(self._numbers, self._number(frame)) if self._keys else np.zeros(len(frame), np.int64)
+        if not self._keys:
+            return np.zeros(len(frame), np.int64)
+        return self.index.get_indexer(frame.set_index(self._keys).index)
 
     def _read(self, columns: Sequence[Column]) -> Iterator[tuple[Array, list[Array]]]:
         """Groups of the rows, and numbers by column, part by part."""
@@ -166,25 +157,25 @@ class Groups:
             means = dict(zip(columns, sums / counts, strict=True))
         return DataFrame({"rows": rows, **means}, index=self.index)
 
-    def spread(self, column: Column, quantiles: Sequence[float] = (0.5,)) -> Spread:
+    def spread(self, column: Column) -> Spread:
         """The spread of a column's numbers in each group."""
-        return spread(lambda: ((groups, values) for groups, (values,) in self._read([column])), len(self), quantiles)
+        return spread(lambda: ((groups, values) for groups, (values,) in self._read([column])), len(self))
 
     def medians(self, column: Column) -> Series:
         """The median of a column in each group."""
-        return Series(self.spread(column).quantiles[0], self.index)
+        return Series(self.spread(column).median, self.index)
 
 
 Stream = Callable[[], Iterable[tuple[Array, Array]]]
 """Gives groups and numbers of rows, part by part, the same each time."""
 
 
-def spread(stream: Stream, groups: int, quantiles: Sequence[float]) -> Spread:
+def spread(stream: Stream, groups: int) -> Spread:
     """The spread of numbers in groups 0 ... groups - 1; NaN where a group has none."""
     count = np.zeros(groups, np.int64)
     for of, _ in _numbers(stream):
         count += np.bincount(of, minlength=groups)
-    ends, total, empty = np.cumsum(count), int(count.sum()), count == 0
+    ends, total, last = np.cumsum(count), int(count.sum()), np.maximum(count - 1, 0)
     first = ends - count
     with TemporaryFile() as file:
         # values of a group side by side, and one more for groups without any
@@ -198,17 +189,10 @@ def spread(stream: Stream, groups: int, quantiles: Sequence[float]) -> Spread:
             free += np.bincount(of, minlength=groups)
         for start, end in zip(first, ends, strict=True):
             grouped[start:end].sort()
-        place = np.asarray([0.0, 1.0, *quantiles])[:, None] * np.maximum(count - 1, 0)
-        # each quantile lies between two ranks
-        below, above = (
-            grouped[np.where(empty, total, first + rank(place).astype(np.int64))] for rank in (np.floor, np.ceil)
-        )
-    share = place - np.floor(place)
-    with np.errstate(invalid="ignore"):
-        # as NumPy interpolates
-        between = np.where(share < 0.5, below + (above - below) * share, above - (above - below) * (1.0 - share))
-        between = np.where(share == 0.5, 0.5 * (below + above), between)
-    return Spread(count, between[0], between[1], between[2:])
+        # the median lies between two ranks; a group without numbers has the one behind all others
+        ranks = (np.where(count == 0, total, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
+        least, below, above, largest = (grouped[rank] for rank in ranks)
+    return Spread(least, 0.5 * (below + above), largest)
 
 
 def _numbers(stream: Stream) -> Iterator[tuple[Array, Array]]:

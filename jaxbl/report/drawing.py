@@ -32,7 +32,6 @@ from .panels import (
     Axis,
     Band,
     Bars,
-    Dots,
     Figure,
     Line,
     Map,
@@ -194,7 +193,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
 def _scales(panels: Sequence[Panel]) -> list[Scale]:
     """Scales of maps that have a colour bar."""
     parts = itertools.chain(*(panel.parts for panel in panels))
-    return list(dict.fromkeys(part.scale for part in parts if isinstance(part, Map | Dots) and part.scale.label))
+    return list(dict.fromkeys(part.scale for part in parts if isinstance(part, Map) and part.scale.label))
 
 
 def _plain(text: str) -> str:
@@ -334,18 +333,13 @@ def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
     ax.pcolormesh(cells.x, cells.y, values, cmap=cells.scale.colours, norm=_norm(cells.scale), **how)
 
 
-def _draw_dots(ax: Axes, dots: Dots, layer: float) -> None:
-    how: Any = {"cmap": dots.scale.colours, "norm": _norm(dots.scale), "s": 16, "linewidths": 0, "rasterized": True}
-    ax.scatter(dots.x, dots.y, c=dots.values, zorder=layer, **how)
-
-
 def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
     ax.barh(bars.places, bars.lengths, bars.thickness, color=bars.colour, alpha=bars.opacity, zorder=layer)
     for place, length, text in zip(bars.places, bars.lengths, bars.texts):  # noqa: B905
         ax.annotate(f" {_plain(text)}", (length, place), va="center", fontsize=9)
 
 
-_DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _draw_map, Dots: _draw_dots, Bars: _draw_bars}
+_DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _draw_map, Bars: _draw_bars}
 
 
 def _legend_handles(panel: Panel) -> dict[str, Any]:

@@ -4,14 +4,14 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # pyright: reportReturnType=false, reportAssignmentType=false
 
-import math
 import re
 from collections.abc import Iterable
 from functools import lru_cache
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from matplotlib.ticker import EngFormatter
 from pandas import DataFrame, Series
 
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
@@ -28,15 +28,12 @@ from .checks import MOST_PARTS, check_figures, has_words, values_of
 from .gain_plane import condition_curves
 from .panels import (
     COLOURS,
-    MISSING,
     Array,
     Axis,
     Band,
-    Dots,
     Figure,
     Line,
     Map,
-    Pair,
     Panel,
     Part,
     Scale,
@@ -45,8 +42,6 @@ from .panels import (
     with_unit,
 )
 from .refined_maps import Filling, on_coarse_values
-
-_MOST_DOTS = 100_000
 
 
 def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
@@ -81,16 +76,13 @@ def draw(result: StudyResult) -> list[Figure]:
     figures: list[Figure] = []
     runs = sum(map(len, result.batches(["seed"]))) if specs else 0
     for i, spec in enumerate(specs):
-        dots = _dots(result, spec)
         if spec.theory is not None:
             panels, caption = _laws(config, spec, [law for law in laws_of(result) if law.figure == i])
         elif spec.kind == "heatmap":
-            panels, caption = _heatmap(config, _rows(result, spec, points, dots), spec, points)
+            panels, caption = _heatmap(config, _rows(result, spec, points), spec, points)
         else:
-            panels, caption = _lines(config, _rows(result, spec, points, dots), spec)
+            panels, caption = _lines(config, _rows(result, spec, points), spec)
         caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}"
-        if dots is not None:
-            caption += f" The first {len(dots)} points of the design are shown."
         if not result.is_finished(runs):
             caption += f" The study is not finished: {runs} runs so far, white where none is."
         name = re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{spec.value}").strip("_")
@@ -101,34 +93,28 @@ def draw(result: StudyResult) -> list[Figure]:
     return figures
 
 
-def _rows(result: StudyResult, figure: FigureTable, points: Points | None, dots: Series | None) -> Rows:
-    """The rows that a figure shows, with the columns that it needs."""
+def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Rows:
+    """The rows that a figure shows, with the columns that it needs; of a quasi-random design at the middles of bins."""
     config = result.config
     metrics = {f"{side}.{name}" for side in config.sides for name in ("converged", "f_plus", "margin_alpha")}
     metrics |= {figure.value, "finite"}
-    columns = [*config.axis_paths, *(name for name in result.columns if name in metrics)]
+    columns = [*config.axis_paths, "seed", *(name for name in result.columns if name in metrics)]
+    random = [axis for axis in config.axes if axis.path in (figure.x, figure.y) and axis.values is None and axis.num is None]
+    # about four points in each bin of a map
+    bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))
 
     def select(frame: DataFrame) -> DataFrame:
         if points is not None:
             frame = on_coarse_values(points, frame, [figure.x, figure.y])
-        if dots is not None:
-            frame = frame[frame[dots.name].isin(dots)]
-        return filter_rows(frame, resolve_where(config, figure))
+        frame = filter_rows(frame, resolve_where(config, figure))
+        for axis in random:
+            middles = axis.model_copy(update={"num": 2 * bins + 1}).grid()[1::2]
+            edges = cell_edges(middles, axis.scale == "log")[1:-1]
+            frame = frame.assign(**{axis.path: middles[np.searchsorted(edges, frame[axis.path])]})
+        return frame
 
-    needs = [*(figure.where or {}), *([] if dots is None else [dots.name]), *([] if points is None else columns)]
+    needs = [*(figure.where or {}), *(axis.path for axis in random), *([] if points is None else columns)]
     return Rows(result, columns, select, needs)
-
-
-def _dots(result: StudyResult, figure: FigureTable) -> Series | None:
-    """The dots of a figure that has one for each run of a quasi-random design that has more of them than can be seen: the
-    values that one axis has at the points that are drawn."""
-    config, sampled = result.config, _sampled_axes(result.config)
-    dotted = bool(sampled) and (figure.kind == "heatmap" or {figure.x, figure.facet, figure.series} & set(sampled))
-    if not dotted or figure.theory is not None or result.runs <= _MOST_DOTS:
-        return None
-    values = Points(config).axis_values(sampled[0])
-    # the first points of a design cover its ranges evenly, too
-    return Series(values[: max(len(values) * _MOST_DOTS // result.runs, 1)], name=sampled[0])
 
 
 _WORDS = {
@@ -173,16 +159,12 @@ def unit_of(config: Config, path: str) -> str:
     return "" if parameter is None else parameter.unit
 
 
-_PREFIXES = {-1: "m", -2: "µ", -3: "n"}
-
-
 def with_value(config: Config, path: str, value: Any) -> str:
     """Words for a value of an axis: in milli, micro, nano where that is small."""
     unit = unit_of(config, path)
-    if unit and not isinstance(value, str) and 1e-9 <= abs(value) < 1e-2:
-        power = math.floor(math.log10(abs(value)) / 3.0 + 1e-9)
-        value, unit = float(f"{value * 1e3**-power:.6g}"), _PREFIXES[power] + unit
-    return f"{path_words(config, path)} {_text(value)} {unit}".rstrip()
+    small = unit and not isinstance(value, str) and 1e-9 <= abs(value) < 1e-2
+    text = EngFormatter(unit).format_data(value) if small else f"{_text(value)} {unit}".rstrip()
+    return f"{path_words(config, path)} {text}"
 
 
 def _panel_title(config: Config, spec: FigureTable, value: Any) -> str:
@@ -205,20 +187,12 @@ def _over(config: Config, varied: set[str], spec: FigureTable) -> str:
     """Say what was averaged over, of the axes that varied, for the caption."""
     keys = (spec.x, spec.y, spec.facet, spec.series)
     zipped = {axis.zip for axis in config.axes if axis.path in keys and axis.zip}
-    sampled = _sampled_axes(config)
-    # one point of the design at each place
-    single = {*keys, *(sampled if {*keys} & {*sampled} else ())}
     averaged = [
-        path_words(config, axis.path) for axis in config.axes if axis.path in varied - single and axis.zip not in zipped
+        path_words(config, axis.path) for axis in config.axes if axis.path in varied - {*keys} and axis.zip not in zipped
     ]
     if config.sweep.seeds > 1:
         averaged.append(f"{config.sweep.seeds} seeds")
     return f"; {'share' if is_boolean(spec.value) else 'median'} over {', '.join(averaged)}" if averaged else ""
-
-
-def _sampled_axes(config: Config) -> list[str]:
-    """Axes of a quasi-random design."""
-    return [axis.path for axis in config.axes if axis.values is None and axis.num is None]
 
 
 def flat_remark(values: Array) -> str:
@@ -264,76 +238,12 @@ def is_log(config: Config, path: str, values: Array) -> bool:
     return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
 
 
-class _Panel(NamedTuple):
-    """A panel of a map: its title, values over (y, x), shares of runs that stayed finite and that converged (None where the
-    study does not say), the place (y, x) of the best gains on a map of errors over gains, the f_plus that conditions are
-    drawn for, and its rows where each is a dot."""
-
-    title: str
-    table: Series
-    finite: Series
-    converged: Series | None
-    best: Pair | None
-    bound: float | None
-    dots: DataFrame | None
-
-
 def _split(table: Any, spec: FigureTable) -> list[tuple[Any, Any]]:
     """The value of each panel, and the panel's part of a table or of rows; None and all where there is one panel."""
     if spec.facet is None:
         return [(None, table)]
     parts = table.groupby(spec.facet, sort=True)
     return [(value, part.droplevel(0) if spec.facet in part.index.names else part) for value, part in parts]
-
-
-def _map_panels(
-    config: Config, rows: Rows, spec: FigureTable, points: Points | None
-) -> tuple[list[_Panel], Filling | None, set[str]]:
-    """The panels of a map, of a refined study what fills its places, and the axes that varied."""
-    assert spec.y is not None
-    keys, paths = [spec.y, spec.x], config.axis_paths
-    group_paths = keys if spec.facet is None else [spec.facet, *keys]
-    simulated = groups = Groups(rows, group_paths, paths)
-    filling, filled, varied = None, rows, groups.varied
-    if points is not None:
-        # a refined study has its points for their places: all of them are filled
-        filling = Filling(points, rows.frame, spec.x, spec.y)
-        unseen = [path for path in paths if path not in group_paths]
-        filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec)]
-        groups = Groups(filled, group_paths, paths)
-    side = spec.value.partition(".")[0]
-    columns = next(iter(filled)).columns
-    numbers = {name: _number_column(name) for name in ("finite", f"{side}.converged") if name in columns}
-    shares = groups.means(numbers)
-    column = _drawn_column(spec.value)
-    # one number for each group: the median over what else varies, or the share that is true
-    tables = groups.means({"middle": column})["middle"] if is_boolean(spec.value) else groups.medians(column)
-    # an average of the runs that did not diverge would hide that one did
-    shares["table"] = tables if spec.value == "finite" else tables.where(shares["finite"] == 1.0)
-    bounds = _bounds(filled, spec, points) if spec.overlays else None
-    gridded, errors = config.sweep.design == "grid", None
-    if (
-        gridded
-        and f"{side}.converged" in numbers
-        and re.search(r"rmse|chatter|convergence_time$", spec.value)
-        and all(path.startswith(f"observer.{side}.") for path in keys)
-    ):
-        # of a refined study those that were simulated
-        errors = dict(_split(worst_runs(simulated, spec.value, f"{side}.margin_alpha" in columns), spec))
-    dots = None if gridded else dict(_split(rows.frame, spec))
-    panels = [
-        _Panel(
-            title=_panel_title(config, spec, value),
-            table=part["table"],
-            finite=part["finite"],
-            converged=part.get(f"{side}.converged"),
-            best=errors and (best := best_gains(errors[value])) and errors[value].index[best.index],
-            bound=None if bounds is None else float(bounds.iloc[i]),
-            dots=dots and dots[value],
-        )
-        for i, (value, part) in enumerate(_split(shares, spec))
-    ]
-    return panels, filling, varied
 
 
 def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points | None) -> Series:
@@ -359,65 +269,70 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points | None)
 def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> tuple[list[Panel], str]:
     """A map; with `points` of a refined study, those that were not simulated show the nearest that was."""
     assert spec.y is not None
-    panels, filling, varied = _map_panels(config, rows, spec, points)
-    works = [panel.table[~_find_failures(panel, spec)].to_numpy(float) for panel in panels]
-    scale = colour_scale(np.concatenate(works), value_label(spec.value), spec.scale)
+    side, paths, axes = spec.value.partition(".")[0], config.axis_paths, (spec.x, spec.y)
+    keys = [path for path in (spec.facet, spec.y, spec.x) if path is not None]
+    simulated = groups = Groups(rows, keys, paths)
+    filling, filled = None, rows
+    if points is not None:
+        # a refined study has its points for their places: all of them are filled
+        filling = Filling(points, rows.frame, *axes)
+        unseen = [path for path in paths if path not in keys]
+        filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec)]
+        groups = Groups(filled, keys, paths)
+    table, converged = _map_table(groups, next(iter(filled)), spec.value), f"{side}.converged"
+    bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
+    errors, judged = {}, re.search(r"rmse|chatter|convergence_time$", spec.value) and converged in table
+    if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
+        # of a refined study those that were simulated
+        has_margin = f"{side}.margin_alpha" in next(iter(filled))
+        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec))
+    scale = colour_scale(table["value"][~table["failed"]].to_numpy(float), value_label(spec.value), spec.scale)
     if is_boolean(spec.value):
         scale = scale._replace(low=0.0, high=1.0, log=False)
-    name = _failure_name(panels, spec)
-    drawn = []
-    for panel in panels:
-        axes, parts = _map_parts(config, panel, spec, scale, filling, name)
-        under = [flat_remark(panel.table[~_find_failures(panel, spec)].to_numpy(float))]
-        if panel.bound is not None:
-            alpha_is_x = spec.x.endswith(".alpha")
-            alphas = axes[0 if alpha_is_x else 1].ends
-            parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, panel.bound, alphas, alpha_is_x)
-            under.append(f"f⁺ = {panel.bound:.3g} rad/s²")
-        if panel.best is not None:
-            parts.append(mark(*panel.best[::-1], "best", size=13.0))
-            under.insert(1, f"best ★ {panel.table[panel.best]:.2g} {find_metric(spec.value).unit}".rstrip())
-        title = "\n".join(filter(None, (panel.title, ",  ".join(filter(None, under)))))
-        drawn.append(Panel(*axes, parts, title))
-    return drawn, f" and {path_words(config, spec.y)}{_over(config, varied, spec)}."
+    failure, drawn = _failure_name(table[table["failed"]], spec.value), []
+    for i, (value, part) in enumerate(_split(table, spec)):
+        *centres, grid = _dense(part["value"], filling)
+        *_, failed = _dense(part["failed"].astype(float), filling)
+        # what an unfinished study has not computed yet stays white
+        failed = failed > 0.5 if filling is None else (failed > 0.5) | np.isnan(grid)
+        x, y = (axis_of(config, *axis) for axis in zip(axes, centres, strict=True))
+        edges = (cell_edges(values, axis.log) for values, axis in zip(centres, (x, y), strict=True))
+        parts: list[Part] = [Map(*edges, grid, scale, failed, failure)]
+        under = [flat_remark(part["value"][~part["failed"]].to_numpy(float))]
+        if errors and (best := best_gains(errors[value])):
+            place = errors[value].index[best.index]
+            parts.append(mark(*place[::-1], "best", size=13.0))
+            under.append(f"best ★ {part['value'][place]:.2g} {find_metric(spec.value).unit}".rstrip())
+        if bounds is not None:
+            bound, alpha_is_x = float(bounds[i]), spec.x.endswith(".alpha")
+            alphas = (x if alpha_is_x else y).ends
+            parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
+            under.append(f"f⁺ = {bound:.3g} rad/s²")
+        title = "\n".join(filter(None, (_panel_title(config, spec, value), ",  ".join(filter(None, under)))))
+        drawn.append(Panel(x, y, parts, title))
+    return drawn, f" and {path_words(config, spec.y)}{_over(config, groups.varied, spec)}."
 
 
-def _find_failures(panel: _Panel, spec: FigureTable) -> Series:
-    """Find the places of a map without a value that means something: too few of their runs converged, or one diverged."""
-    failed, side = panel.table.isna(), spec.value.partition(".")[0]
-    if panel.converged is not None and spec.value != f"{side}.converged":
-        failed |= panel.converged < 0.5
-    return failed
+def _map_table(groups: Groups, sample: DataFrame, value: str) -> DataFrame:
+    """The places of a map: `value`, whether it is none that means something (`failed`: too few of its runs converged, or
+    one diverged), and the shares of runs that are `finite` and converged, of the columns that `sample` has."""
+    converged, column = f"{value.partition('.')[0]}.converged", _drawn_column(value)
+    table = groups.means({name: _number_column(name) for name in ("finite", converged) if name in sample})
+    # one number for each group: the median over what else varies, or the share that is true
+    middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.medians(column)
+    # an average of the runs that did not diverge would hide that one did
+    table["value"] = middle if value == "finite" else middle.where(table["finite"] == 1.0)
+    table["failed"] = table["value"].isna()
+    if converged in table and value != converged:
+        table["failed"] |= table[converged] < 0.5
+    return table
 
 
-def _failure_name(panels: list[_Panel], spec: FigureTable) -> str:
+def _failure_name(failures: DataFrame, value: str) -> str:
     """Say what happened where a map is grey, and at how many points; "" where it is nowhere."""
-    failed = [_find_failures(panel, spec) for panel in panels]
-    count = sum(map(int, map(sum, failed)))
-    diverged = sum(int((panel.finite[rows] < 1.0).sum()) for panel, rows in zip(panels, failed, strict=True))
-    word = "not converged" if panels[0].converged is not None or "time" in spec.value else "undefined"
-    return f"{'diverged' if diverged == count else word} ({count} points)" if count else ""
-
-
-def _map_parts(
-    config: Config, panel: _Panel, spec: FigureTable, scale: Scale, filling: Filling | None, failure: str
-) -> tuple[list[Axis], list[Part]]:
-    """Axes, and cells of a grid, or dots of a quasi-random design."""
-    assert spec.y is not None
-    paths, dots = (spec.x, spec.y), panel.dots
-    if dots is not None:
-        axes = [axis_of(config, path, np.unique(dots[path].to_numpy(float))) for path in paths]
-        values = drawn_values(dots, spec.value)
-        there, gone = dots[values.notna()], dots[values.isna()]
-        crosses = Line(gone[spec.x], gone[spec.y], failure, MISSING, 0.0, marker="x", size=4.0)
-        return axes, [Dots(there[spec.x], there[spec.y], values.dropna(), scale), crosses]
-    *centres, grid = _dense(panel.table, filling)
-    axes = [axis_of(config, *axis) for axis in zip(paths, centres, strict=True)]
-    *_, failed = _dense(_find_failures(panel, spec).astype(float), filling)
-    # what an unfinished study has not computed yet stays white
-    failed = failed > 0.5 if filling is None else (failed > 0.5) | np.isnan(grid)
-    edges = (cell_edges(values, axis.log) for values, axis in zip(centres, axes, strict=True))
-    return axes, [Map(*edges, grid, scale, failed, failure)]
+    converges = f"{value.partition('.')[0]}.converged" in failures or "time" in value
+    word = "diverged" if (failures["finite"] < 1.0).all() else "not converged" if converges else "undefined"
+    return f"{word} ({len(failures)} points)" if len(failures) else ""
 
 
 def _dense(table: Series, filling: Filling | None) -> tuple[Array, Array, Array]:
@@ -484,8 +399,8 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
     spread = groups.spread(column)
     table = groups.means({"middle": column}).assign(least=spread.least, largest=spread.largest)
     if not is_boolean(spec.value):
-        table["middle"] = spread.quantiles[0]
-    sampled, band, drawn = spec.x in _sampled_axes(config), "", []
+        table["middle"] = spread.median
+    band, drawn = "", []
     scale = colour_scale(np.concatenate([spread.least, spread.largest]), value_label(spec.value), spec.scale)
     for facet, part in _split(table.reset_index(), spec):
         lines, parts = [(None, part)] if spec.series is None else part.groupby(spec.series, sort=True), list[Part]()
@@ -495,7 +410,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
-            parts.append(Line(x, line["middle"], name, colour, 0.0 if sampled else 1.4, marker="o", size=3.5))
+            parts.append(Line(x, line["middle"], name, colour, marker="o", size=3.5))
         x = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
         drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _panel_title(config, spec, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."

@@ -147,15 +147,6 @@ class Map(NamedTuple):
     name: str = ""
 
 
-class Dots(NamedTuple):
-    """Points `(n,)` with colours of values."""
-
-    x: Any
-    y: Any
-    values: Any
-    scale: Scale
-
-
 class Bars(NamedTuple):
     """Lying bars from 0 at places `(n,)`, with words at their ends."""
 
@@ -168,7 +159,7 @@ class Bars(NamedTuple):
     texts: Sequence[str] = ()
 
 
-Part = Line | Band | Span | Map | Dots | Bars
+Part = Line | Band | Span | Map | Bars
 
 
 class Panel(NamedTuple):
@@ -386,8 +377,6 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
             content["bands"].append(part._asdict() | {key: packed(getattr(part, key)) for key in ("x", "low", "high")})
         elif isinstance(part, Span):
             content["spans"].append(part._asdict())
-        elif isinstance(part, Dots):
-            content["lines"].append({"name": "", "colour": FAINT, "width": 0, "x": packed(part.x), "y": packed(part.y)})
         elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
             cells = {key: packed(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
             scale = part.scale._asdict()

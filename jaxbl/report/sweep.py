@@ -6,10 +6,8 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from jaxbl.files import write_json
@@ -18,11 +16,10 @@ from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
 from jaxbl.lines import Lines, percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
-from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .aggregates import Column, Distinct, Groups, Rows
+from .aggregates import Distinct, Groups, Rows
 from .maps import best_gains, laws_of, slope_text, worst_runs
 
 
@@ -34,15 +31,10 @@ def write_sweep(result: StudyResult, folder: Path) -> str:
 
 
 def describe_sweep(result: StudyResult) -> Result:
-    """Say where the observers work, and which gains are best, with tables of axes, metrics and laws."""
+    """Say where the observers work, and which gains are best, with tables of axes that matter and of laws."""
     survey, laws = _Survey(result), laws_of(result)
-    axes = [
-        [path, len(values), *((values.min(), values.max()) if pd.api.types.is_numeric_dtype(values) else "––")]
-        for path, values in survey.values.items()
-    ]
     tables = [_law_table(laws)] * bool(laws)
     tables += (_importance_table(side, ranked) for side, ranked in survey.importance.items())
-    tables += [ResultTable("Axes", ["path", "values", "least", "largest"], axes), _metric_table(result)]
     answer = answer_sweep(result, survey)
     return replace(answer, remarks=[*answer.remarks, *_law_lines(laws)], tables=tables)
 
@@ -202,14 +194,3 @@ def _law_table(laws: list[Law]) -> ResultTable:
         rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _explain_ends(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return ResultTable("Accuracy laws", columns, rows)
-
-
-def _metric_table(result: StudyResult) -> ResultTable:
-    metrics = {f"{side}.{name}": metric for side, (name, metric) in product(result.config.sides, SIDE_METRICS.items())}
-    metrics = {column: metric for column, metric in metrics.items() if column in result.columns}
-    table, groups = [], Groups(Rows(result, metrics), [])
-    for name, metric in metrics.items():
-        numbers = Column([name], lambda frame, name=name: frame[name].astype(float).replace([np.inf, -np.inf], np.nan))
-        quantiles = groups.spread(numbers, (0.05, 0.5, 0.95)).quantiles[:, 0]
-        table.append([name, *(None if np.isnan(value) else value for value in quantiles), metric.unit, metric.doc])
-    return ResultTable("Metrics over all runs", ["metric", "5 %", "median", "95 %", "unit", "meaning"], table)

@@ -12,7 +12,7 @@ from jaxbl.observer.conditions import least_lambda_seeber_horn
 from jaxbl.report.checks import check_figures
 from jaxbl.report.drawing import save
 from jaxbl.report.maps import draw
-from jaxbl.report.panels import Band, Dots, Line, Map
+from jaxbl.report.panels import Band, Line, Map
 from jaxbl.report.results import write_report
 
 RMSE = "motor.velocity_rmse"
@@ -197,24 +197,27 @@ def test_words_as_panels(tmp_path):
     assert [panel.title.split("\n")[0] for panel in drawing.panels] == ["discretisation explicit", "discretisation implicit"]
 
 
-def test_quasi_random_points_are_dots_and_diverged_ones_crosses(tmp_path):
+def test_quasi_random_points_are_drawn_by_bins_and_diverged_ones_counted(tmp_path):
     axes = [spaced_axis(ALPHA, 1.0, 50.0), spaced_axis(LAMBDA, 1.0, 20.0)]
-    sweep = {"design": "sobol", "points": 32}
+    sweep = {"design": "sobol", "points": 1024}
     wild = {"finite": lambda frame: frame[ALPHA] < 10.0}
-    drawing = draw_only_figure(
-        tmp_path, small_study(axes=axes, sweep=sweep, figures=[heatmap_figure()]), motor__velocity_rmse=product_error, **wild
-    )
-    dots, crosses = drawing.panels[0].parts
-    assert isinstance(dots, Dots) and (dots.x < 10.0).all()
-    np.testing.assert_allclose(dots.values, dots.x * dots.y)
-    assert len(dots.x) + len(crosses.x) == 32
-    assert crosses.name == f"diverged ({len(crosses.x)} points)"
-    # over one of its axes a design has no line
-    drawing = draw_only_figure(
-        tmp_path, small_study(axes=axes, sweep=sweep, figures=[line_figure()]), motor__velocity_rmse=product_error
-    )
-    assert drawing.panels[0].parts[0].width == 0.0
-    assert "median" not in drawing.caption
+    study = small_study(axes=axes, sweep=sweep, figures=[heatmap_figure()])
+    drawing = draw_only_figure(tmp_path, study, motor__velocity_rmse=product_error, **wild)
+    cells = find_map(drawing.panels[0])
+    assert cells.values.shape == (16, 16)
+    alphas, lambdas = (np.sqrt(edges[1:] * edges[:-1]) for edges in (cells.x, cells.y))
+    works = (cells.x[1:] < 10.0)[None, :] & np.isfinite(cells.values)
+    # each cell shows points that lie in it
+    product = lambdas[:, None] * alphas
+    np.testing.assert_allclose(cells.values[works], product[works], rtol=0.25)
+    assert cells.failed[:, alphas > 12.0].all() and not cells.failed[works].any()
+    assert cells.name.startswith("diverged (")
+    # over one of its axes, medians over the others
+    study = small_study(axes=axes, sweep=sweep, figures=[line_figure()])
+    drawing = draw_only_figure(tmp_path, study, motor__velocity_rmse=product_error)
+    line, band = (parts_of(drawing.panels[0], kind)[0] for kind in (Line, Band))
+    assert len(line.x) == 16 and (band.low < line.y).all() and (line.y < band.high).all()
+    assert "median over λ" in drawing.caption
 
 
 def test_lines_have_a_median_a_band_and_a_legend_with_units(tmp_path):

@@ -1,4 +1,4 @@
-"""Maps of refined studies: filled from the finest vertex near each place, and nothing counted that was not simulated."""
+"""Maps of refined studies: filled from the nearest vertex, and nothing counted that was not simulated."""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -127,7 +127,7 @@ def test_filling_is_exact_where_every_vertex_is_known():
 def test_a_map_shows_no_more_places_than_can_be_seen():
     result = make_refined_study(lambda frame: frame[ALPHA] > 3.3, depth=10)
     drawing = draw(result)[0]
-    assert drawn_map(drawing.panels[0]).values.shape == (2049, 2049)
+    assert drawn_map(drawing.panels[0]).values.shape == (1025, 1025)
 
 
 @pytest.mark.parametrize("seeds", [1, 3])

@@ -102,7 +102,7 @@ def test_a_report_in_a_store(bucket):
     write_report(sweep(thirty_run_study(figures=[figure]), address), address)
     stored = read_objects(address)
     (name,) = [name for name in stored if name.startswith("figures/")]
-    assert stored[name].startswith(b"\x89PNG") and b"Metrics over all runs" in stored["report.html"]
+    assert stored[name].startswith(b"\x89PNG") and b"velocity error" in stored["report.html"]
 
 
 def test_bad_addresses(bucket, monkeypatch):

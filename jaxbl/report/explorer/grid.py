@@ -4,6 +4,7 @@ Rows of `points.parquet` are in the order of the axes, which need not be stored 
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -93,13 +94,11 @@ def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path
         x, y = _first_axes(result.config, dims)
         cells = {name: np.moveaxis(values.reshape(shape), (y, x), (-2, -1)) for name, values in columns.items()}
         telling = _most_telling(cells, first)
-        # of the other dimensions, seeds together
-        place = np.insert(np.array(telling, int), [min(x, y), max(x, y) - 1], 0).tolist()
         return {
             "rows": rows,
             "found": runs,
             "total": rows,
-            "start": {"x": x, "y": y, "at": place},
+            "start": {"x": x, "y": y, "at": _place_in_all(telling, x, y).tolist()},
             "overview": _overview(cells[first][telling[:-1]]),
             "stars": _stars(cells, first, dims, x, y, telling),
         }
@@ -154,25 +153,24 @@ def _stars(
     if {*paths} != gains or not {"finite", f"{side}.converged"} <= {*needed} or math.prod(shape[-3:]) > _MOST_STARRED:
         return []
     values = [np.asarray(next(iter(dims[i].values()))) for i in (y, x)]
-    grid = dict(zip(paths, (axis.reshape(-1) for axis in np.meshgrid(*values, indexing="ij")), strict=True))
+    runs = pd.MultiIndex.from_product([range(shape[-3]), *values], names=["seed", *paths]).to_frame(index=False)
     stars = []
     for index in [telling[:-1], *(index for index in np.ndindex(*shape[:-3]) if index != telling[:-1])][:64]:
-        runs = [
-            pd.DataFrame(grid | {"seed": seed} | {name: cells[name][(*index, seed)].reshape(-1) for name in needed})
-            for seed in range(shape[-3])
-        ]
-        frame = pd.concat(runs, ignore_index=True).dropna(subset=["finite", f"{side}.converged"])
-        if len(frame) < math.prod(shape[-2:]):
+        frame = runs.assign(**{name: cells[name][index].ravel() for name in needed})
+        if frame[["finite", f"{side}.converged"]].isna().any(axis=None):
             continue
         worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first, f"{side}.margin_alpha" in needed)
         if (best := best_gains(worst)) is not None:
-            gains_there = zip((y, x), values, worst.index[best.index], strict=True)
-            place = {i: int(np.flatnonzero(axis == value)[0]) for i, axis, value in gains_there}
-            place |= zip([i for i in range(len(dims) - 1) if i not in place], index, strict=True)
-            stars.append(
-                {"metric": first, "first": index == telling[:-1], "at": [place.get(i, 0) for i in range(len(dims))]}
-            )
+            place = _place_in_all([*index, 0], x, y)
+            gains_there = zip(values, worst.index[best.index], strict=True)
+            place[[y, x]] = [np.flatnonzero(axis == value)[0] for axis, value in gains_there]
+            stars.append({"metric": first, "first": index == telling[:-1], "at": place.tolist()})
     return stars
+
+
+def _place_in_all(others: Sequence[int], x: int, y: int) -> Array:
+    """The place along all dimensions of one along those that are not drawn."""
+    return np.insert(np.array(others, int), [min(x, y), max(x, y) - 1], 0)
 
 
 def _overview(values: Array) -> JsonObject:
