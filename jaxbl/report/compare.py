@@ -15,7 +15,6 @@ from jaxbl.config import is_boolean
 from jaxbl.files import write_atomic, write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
-from jaxbl.sweeps.metrics import find_metric
 
 from .maps import value_label
 from .panels import (
@@ -85,7 +84,6 @@ def describe_comparison(comparison: Comparison) -> Result:
     remarks += [
         f"Points: {common} in both{alone}.",
         *([_noise(comparison)] if common else []),
-        *(_most(comparison, change) for change in changed[:1] if change.most),
     ]
     for i, study in enumerate(names):
         gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
@@ -120,14 +118,6 @@ def _noise(comparison: Comparison) -> str:
     return (
         f"Noise: by {how}; of the points counted at most {100 * FALSE_DISCOVERY_RATE:g} % on average are not different.{few}"
     )
-
-
-def _most(comparison: Comparison, change: MetricChange) -> str:
-    """The largest change of a metric, and the point where it is."""
-    assert change.most is not None
-    place = ", ".join(f"{path} = {_value(change.most[path])}" for path in comparison.axes)
-    ends = f"{change.most['first']:.3g} -> {change.most['second']:.3g} {find_metric(change.metric).unit}".rstrip()
-    return f"Largest change of {change.metric}: {ends}{f' at {place}' if place else ''}."
 
 
 def _ways(change: MetricChange) -> str:

@@ -1,6 +1,6 @@
 """What `jaxbl diagnose` leaves to be read: missing effects, their probability, and model errors before and after."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ def write_diagnosis(result: Diagnosis, folder: Path) -> str:
 def describe_diagnosis(summary: JsonObject) -> Result:
     """Say what the model lacks, how sure that is, and how much better it is with it, from a `diagnosis.json`."""
     verdict, headline = _verdict(summary)
-    tables = [table for table in (_finding_table(summary), _history_table(summary)) if table.rows]
+    tables = [_history_table(summary)] * bool(summary["history"])
     tables += [
         _gap_table(summary["gap"]),
         number_table("Parameters of the model", read_quantities(summary["parameters"])),
@@ -170,12 +170,9 @@ def _what_to_record(summary: JsonObject) -> str:
         f"{name} is {rms_text(torque['torque'])} {units['torque_motor']} rms there, {rms_text(torque['on_log'])} on the log"
         for name, torque in effects.items()
     ]
-    lead = (
-        "The held-out data would pass without it, too"
-        if effects
-        else "Even a complete model may leave as much as moves there"
-    )
-    lead += f" ({'; '.join(torques)})." if torques else "."
+    lead = "Even a complete model may leave as much as moves there."
+    if torques:
+        lead = f"The held-out data would pass without it, too ({'; '.join(torques)})."
     # it acts there, but less than a complete model may leave
     if effects and all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
         return f"{lead} Hold out a motion in which it is a larger part of the torque, or one that is read with less noise."
@@ -194,23 +191,13 @@ def _table_lines(summary: JsonObject) -> Lines:
     """Say what tables of torques without a name add."""
     if "torque_tables" not in summary:
         return []
-    added, gap = summary["torque_tables"], summary["gap"]
+    added = summary["torque_tables"]
     torques = [
         f"{side} torque over {_join_words([_OVER[table['over']] for table in tables])}"
         for side, tables in added["tables"].items()
     ]
-    errors = "; ".join(_changes(gap, gap["holdout_rmse_after"], added["holdout_rmse"]).values())
-    than = "" if added["holdout_z"] > 0.0 else ", which is no better"
-    return [f"Not named, but in model.toml as a table: {_join_words(torques)}. On held-out data it takes {errors}{than}."]
-
-
-def _changes(gap: JsonObject, before: Mapping[str, float | None], after: Mapping[str, float | None]) -> dict[str, str]:
-    """Say how the errors of positions and torques change, by channel."""
-    return {
-        name: f"{name} {rms_text(before[name])} -> {rms_text(value)} {gap['units'][name]}"
-        for name, value in after.items()
-        if not name.startswith("velocity")
-    }
+    than = "" if added["holdout_z"] > 0.0 else ", which predict held-out data no better"
+    return [f"Not named, but in model.toml as tables: {_join_words(torques)}{than}."]
 
 
 def _share(value: float | None) -> str:
@@ -271,18 +258,13 @@ def probability(value: float) -> str:
 
 
 def _gap_lines(gap: JsonObject) -> Lines:
-    holdout, run = gap["holdout"], gap["free_run"]
+    holdout = gap["holdout"]
     place = f"On the last part of the log ({holdout['from']:.4g} to {holdout['to']:.4g} s), held out"
     if holdout["separate"]:
         place = f"On {Path(holdout['file']).name}"
     window = holdout["window"]
     how = "one sample ahead" if not window else f"over windows of {window:.2g} s"
-    lines = [f"{place}, the motion is predicted {how}."]
-    if "after" in run:
-        lines.append(f"In one free run: {'; '.join(_changes(gap, run['before'], run['after']).values())}.")
-    elif run:
-        lines.append(f"No free run is compared: {run['why_not']}.")
-    return lines
+    return [f"{place}, the motion is predicted {how}."]
 
 
 def rms_text(value: float | None) -> str:
@@ -291,49 +273,15 @@ def rms_text(value: float | None) -> str:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines, where = [], summary["where"]
+    lines = []
     if summary["verdict"] != "unknown_effect" or summary["findings"]:
-        lines += [f"Residual of the model as given: {side['sentence']}." for side in where.values()]
-    remaining = [(name, torque) for name, torque in summary["rest"].items() if (torque["evidence"] or 0.0) > 0.0]
-    for name, torque in sorted(remaining, key=lambda pair: -pair[1]["evidence"]):
-        side, _, kind = name.partition(".")
-        lines.append(
-            f"Remaining: {_FREE.get(kind, kind)} on the {side} side ({percent(torque['share'])} of the driving torque, "
-            f"evidence {torque['evidence']:.3g} nats)."
-        )
+        lines += [f"Residual of the model as given: {side['sentence']}." for side in summary["where"].values()]
     return [*lines, *summary["notes"]]
 
 
 def _ratio(error: float | None, other: float | None) -> float:
     """Say how many times an error is larger than another one; infinitely many where a model diverges."""
     return np.inf if error is None or other is None else error / max(other, np.finfo(float).tiny)
-
-
-_FREE = {
-    "time": "a torque over time", "drift": "a drifting friction", "position": "a torque over position",
-    "place": "a friction over position", "velocity": "a torque over velocity", "memory": "a presliding friction",
-}  # fmt: skip
-
-
-def _finding_table(summary: JsonObject) -> ResultTable:
-    rows: list[list[object]] = []
-    for name, finding, is_found in _candidates(summary):
-        lead = [name, probability(finding["confidence"])]
-        if not is_found:
-            rows.append([*lead, "", "", "", ""])
-            continue
-        for leaf, number in read_quantities(finding["parameters"]).items():
-            rows.append([*lead, leaf, number.value, number.standard_error or None, number.unit])
-    return ResultTable("Missing effects", ["effect", "confidence", "parameter", "value", "standard error", "unit"], rows)
-
-
-def _candidates(summary: JsonObject) -> list[tuple[str, JsonObject, bool]]:
-    """Effects that were found, each followed by those that the log does not rule out instead: name, result, and which."""
-    candidates: list[tuple[str, JsonObject, bool]] = []
-    for finding in summary["findings"]:
-        candidates.append((finding["effect"], finding, True))
-        candidates += [(f"or {other['effect']}", other, False) for other in finding["alternatives"]]
-    return candidates
 
 
 def _history_table(summary: JsonObject) -> ResultTable:
@@ -348,9 +296,10 @@ def _history_table(summary: JsonObject) -> ResultTable:
 
 def _gap_table(gap: JsonObject) -> ResultTable:
     control, units = gap["controls"].get("wrong"), gap["units"]
+    limits = {name: error["limit"] for name, error in gap["expected"].items()}
     rows: list[list[Any]] = [
         [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
-        + [error.get(name) for error in (_limits(gap), *([control["rmse"]] if control else []))]
+        + [error.get(name) for error in (limits, *([control["rmse"]] if control else []))]
         for name, before in gap["holdout_rmse_before"].items()
     ]
     for name, torque in gap.get("slow_torques", {}).items():
@@ -367,11 +316,6 @@ def _gap_table(gap: JsonObject) -> ResultTable:
         *([control["effect"]] if control else []),
     ]
     return ResultTable("Held-out data, rms", head, rows)
-
-
-def _limits(gap: JsonObject) -> dict[str, float | None]:
-    """The most that a complete model leaves of each channel."""
-    return {name: error["limit"] for name, error in gap["expected"].items()}
 
 
 def draw_diagnosis(diagnosis: Diagnosis) -> list[Figure]:

@@ -1,17 +1,13 @@
-"""Figures of `jaxbl identify`: torque over twist or velocity, numbers with intervals, and what the model leaves."""
+"""Figures of `jaxbl identify`: torque over twist or velocity, and what the model leaves."""
 
 import numpy as np
 
 from jaxbl.estimation.identify import Identification
-from jaxbl.lines import percent
-from jaxbl.quantity import Quantity
 
 from .log_signals import LogSignals
 from .motor_alone_figures import draw_motor_alone
 from .panels import (
     BLACK,
-    BLUE,
-    FAINT,
     GREEN,
     PURPLE,
     SIDE_COLOURS,
@@ -25,11 +21,9 @@ from .panels import (
     Part,
     Span,
     cloud,
-    intervals,
     join,
     limits,
     missing_quantity,
-    name_rows,
     shade_gap,
     stack,
 )
@@ -39,41 +33,9 @@ def draw_identification(result: Identification) -> list[Figure]:
     """All figures of an identification."""
     log = LogSignals(result)
     if "backlash" in result.summary:
-        return [_intervals(result), draw_motor_alone(result), _residuals(log)]
+        return [draw_motor_alone(result), _residuals(log)]
     first = _hysteresis if log.geared else _friction
-    return [first(log), _intervals(result), _residuals(log)]
-
-
-def _intervals(result: Identification) -> Figure:
-    fitted = {
-        path: (number, nominal)
-        for path, number in result.parameters.items()
-        if (nominal := number.nominal) is not None and number.is_finite
-    }
-    ends, names, inside = [], [], [0.0]
-    for path, (number, nominal) in fitted.items():
-        value, (low, high) = number.value, number.ends()
-        half, size = 0.5 * abs(high - low), abs(nominal) or abs(value) or 1.0
-        low, middle, high = (100.0 * (end - nominal) / size for end in (low, value, high))
-        ends.append((low, middle, high))
-        inside += [max(low, middle - 100.0), min(high, middle + 100.0)]
-        names.append(f"{path}\n{Quantity(value, half, unit=number.unit)} ({percent(half / (abs(value) or 1.0))})")
-    held = [path for path in dict.fromkeys(result.summary["held"]) if path not in fitted]
-    names += [f"{path}\nheld at nominal: not seen in this log" for path in held]
-    room = 0.06 * (max(inside) - min(inside)) or 1.0
-    places, count = np.arange(len(names)), len(fitted)
-    low, middle, high = np.reshape(ends, (-1, 3)).T
-    drawn = [
-        Span(0.0, 0.0, width=0.8, dashes="-"),
-        *intervals(places[:count], low, middle, high, colour=BLUE),
-        Line(np.zeros(len(held)), places[count:], colour=FAINT, width=0.0, marker="o", fill="#FFFFFF"),
-    ]
-    x = Axis("difference from the nominal value (% of it)", ends=(min(inside) - room, max(inside) + room))
-    caption = (
-        "Fitted parameters as differences from their nominal values (the line at 0), with 95 % intervals that allow for "
-        "correlated residuals; below each name its value, half width of the interval, and its share of the value."
-    )
-    return Figure("intervals", [Panel(x, name_rows(names), drawn)], caption, height=0.9 + 0.45 * len(names))
+    return [first(log), _residuals(log)]
 
 
 def _residuals(log: LogSignals) -> Figure:

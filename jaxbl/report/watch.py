@@ -3,7 +3,6 @@
 import csv
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxbl.files import catch_write_errors, write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
-from jaxbl.result import KeyFigure, Result, ResultTable
+from jaxbl.result import KeyFigure, Result
 
 from .numbers import lead_with_doubt
 from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits, stack, stretches
@@ -59,14 +58,6 @@ def describe_watch(watch: Watch) -> Result:
     elif limit is not None:
         gap = f"{last['half_gap']:.4g} (95 %: at most {last['half_gap_to']:.4g})"
         headline = f"No alarm: the half gap is {gap}, and the limit {limit:g} {units['half_gap']}."
-    ends = [summary[end] or {} for end in ("first", "last")]
-    rows = [
-        [f"{side}: {label}", *(values.get(f"{side}.{name}{kind}") for values in ends for kind in ("", "_error")),
-         task.units[side][name]]
-        for side, (name, label) in product(SIDES, LABELS.items())
-        if f"{side}.{name}" in watch.values
-    ]  # fmt: skip
-    columns = ["number", "first value", "standard error", "last value", "standard error", "unit"]
     figures = [
         KeyFigure(
             f"{end[name]:.4g} {units[name]}",
@@ -86,8 +77,7 @@ def describe_watch(watch: Watch) -> Result:
     if summary["left_out"]:
         remarks.append(f"Of the stream: {describe_counts(summary['left_out'])}.")
     title = task.config.title or f"Watch of {Path(task.name).name}"
-    tables = [ResultTable("Numbers", columns, rows)]
-    result = Result(title, verdict, headline, figures, remarks, summary["notes"], tables)
+    result = Result(title, verdict, headline, figures, remarks, summary["notes"])
     return result if verdict == "failed" else lead_with_doubt(result)
 
 
