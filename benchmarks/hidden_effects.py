@@ -57,7 +57,7 @@ def _first_advice(
     """The answer of `jaxbl diagnose`, and the first command that it proposes."""
     from jaxbl.cli.next_steps import LogCall, after_diagnosis
     from jaxbl.diagnosis.diagnose import read_diagnosis_task
-    from jaxbl.report.diagnose import describe_diagnosis
+    from jaxbl.report.diagnose import describe as describe_diagnosis
 
     task = read_diagnosis_task(list(logs), model, holdout=holdout)
     log_call = LogCall(list(logs), Path("model.toml"), holdout, None, Path("diagnosed"), [])

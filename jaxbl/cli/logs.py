@@ -128,13 +128,13 @@ def identify(
                 "anyway) and --next-experiment (which is for drives); leave these out"
             )
         from jaxbl.estimation.element import read_element_task, run_element
-        from jaxbl.report.element import describe_element
+        from jaxbl.report.element import describe as describe_element
 
         task, file = read_element_task(log[0], table, gear_ratio, holdout=holdout), folder / "identification.json"
         summary = run_or_read(task, file, run_element, jaxbl.write_report, overwrite=overwrite)
         return Outcome(describe_element(summary), folder, summary=summary)
     from jaxbl.estimation.identify import read_identification_task, run_identification
-    from jaxbl.report.identify import describe_identification
+    from jaxbl.report.identify import describe as describe_identification
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     if next_experiment is not None:
@@ -196,7 +196,7 @@ def diagnose(
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
     workers.start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
-    from jaxbl.report.diagnose import describe_diagnosis
+    from jaxbl.report.diagnose import describe as describe_diagnosis
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = folder_of(log[0], "diagnosed", out)

@@ -32,7 +32,7 @@ _ROWS = 12
 """Factor within which a change is the same everywhere: a map of it would have one colour."""
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> str:
+def write(comparison: Comparison, folder: Path) -> str:
     """Write `comparison.json`, the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
     tabulate_points(comparison).to_parquet(folder / "comparison.parquet")
     write_atomic(folder / "study.toml", comparison.first_config.to_toml())
@@ -54,7 +54,7 @@ def tabulate_points(comparison: Comparison) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def describe_comparison(comparison: Comparison) -> Result:
+def describe(comparison: Comparison) -> Result:
     """Say which metrics changed by more than noise, whether for the better, and what changed in the config."""
     common, first, second = comparison.points
     names, beyond = comparison.names, _noise_name(comparison)
@@ -155,7 +155,7 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def draw_comparison(comparison: Comparison) -> list[Figure]:
+def draw(comparison: Comparison) -> list[Figure]:
     """Mean and spread of the factor of each metric that changed and has one; nothing where there is none."""
     changes = sorted((change for change in comparison.metrics if change.count), key=lambda change: not change.better)
     rows = {}

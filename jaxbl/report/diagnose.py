@@ -36,12 +36,12 @@ _CHANNELS = {
 }  # fmt: skip
 
 
-def write_diagnosis(result: Diagnosis, folder: Path) -> str:
+def write(result: Diagnosis, folder: Path) -> str:
     """Write `diagnosis.json`, `model.toml` and `trace.parquet`. Returns the TOML of the extended model."""
     return write_fit(result, folder, "diagnosis")
 
 
-def describe_diagnosis(summary: JsonObject) -> Result:
+def describe(summary: JsonObject) -> Result:
     """Say what the model lacks, how sure that is, and how much better it is with it, from a `diagnosis.json`."""
     verdict, headline = _verdict(summary)
     tables = [_history_table(summary)] * bool(summary["history"])
@@ -318,7 +318,7 @@ def _gap_table(gap: JsonObject) -> ResultTable:
     return ResultTable("Held-out data, rms", head, rows)
 
 
-def draw_diagnosis(diagnosis: Diagnosis) -> list[Figure]:
+def draw(diagnosis: Diagnosis) -> list[Figure]:
     """All figures of a diagnosis."""
     if not diagnosis.located:
         return [draw_motor_alone(diagnosis)]

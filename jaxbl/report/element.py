@@ -14,13 +14,13 @@ from .numbers import lead_with_doubt, number_figures, number_table, write_fit
 from .panels import BLUE, ORANGE, TIME, Axis, Figure, Line, Panel, Part, Span, cloud, join, missing_quantity, stack
 
 
-def write_element(result: ElementIdentification, folder: Path) -> str:
+def write(result: ElementIdentification, folder: Path) -> str:
     """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the TOML of the transmission."""
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(result.tables)
     return write_fit(result, folder, "identification", model)
 
 
-def describe_element(summary: JsonObject) -> Result:
+def describe(summary: JsonObject) -> Result:
     """Say how well the transmission explains the torque, and its numbers, from an `identification.json`."""
     numbers, torque = read_quantities(summary["parameters"]), summary["torque"]["element"]
     headline = (
@@ -53,7 +53,7 @@ def _size(error: JsonObject, unit: str) -> str:
     return f"{error['rms']:.3g} {unit} rms, {percent(error['relative'])} of the torque"
 
 
-def draw_element(result: ElementIdentification) -> list[Figure]:
+def draw(result: ElementIdentification) -> list[Figure]:
     """All figures of a transmission on a test rig."""
     trace, record, numbers = result.trace, result.task.record, result.element.numbers
     unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))

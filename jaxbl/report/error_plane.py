@@ -77,12 +77,12 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
                 right.append(Line(count, peaks[0] * factor**count, f"{name}: ratio {factor:.3g}", width=1.0, dashes=dashes))
     reaches = [plane_reach(*values) for values in zip((error, slope), curve, strict=True)]
     labels = "position error e (rad)", "its slope ė (rad/s)"
-    plane = [Axis(label, ends=(-reach, reach) if reach else None) for label, reach in zip(labels, reaches, strict=True)]
+    x, y = (Axis(label, ends=(-reach, reach) if reach else None) for label, reach in zip(labels, reaches, strict=True))
     reason = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
     return [
         Figure(
             f"error_plane_{side}",
-            [Panel(*plane, left), Panel(Axis("half cycle"), axis, right)],
+            [Panel(x, y, left), Panel(Axis("half cycle"), axis, right)],
             f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane, and its "
             f"velocity peaks (analogue of Fig. 29). The majorant of the proof is for the worst disturbance within "
             f"f⁺ = {bound:.3g} rad/s², without friction; a ratio below 1 proves convergence.{reason}",

@@ -10,15 +10,16 @@ from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
+from .identify_figures import draw as draw
 from .numbers import lead_with_doubt, number_figures, number_table, write_fit
 
 
-def write_identification(result: Identification, folder: Path) -> str:
+def write(result: Identification, folder: Path) -> str:
     """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the model's TOML."""
     return write_fit(result, folder, "identification")
 
 
-def describe_identification(summary: JsonObject) -> Result:
+def describe(summary: JsonObject) -> Result:
     """Say whether the model explains the log, and which numbers it has, from an `identification.json`."""
     parameters = read_quantities(summary["parameters"])
     numbers = {path: number for path, number in parameters.items() if number.is_finite}

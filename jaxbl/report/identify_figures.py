@@ -29,7 +29,7 @@ from .panels import (
 )
 
 
-def draw_identification(result: Identification) -> list[Figure]:
+def draw(result: Identification) -> list[Figure]:
     """All figures of an identification."""
     log = LogSignals(result)
     if "backlash" in result.summary:

@@ -36,13 +36,13 @@ _CHANNELS = {
 """Label and colour of each channel."""
 
 
-def write_inspection(inspection: Inspection, folder: Path) -> str:
+def write(inspection: Inspection, folder: Path) -> str:
     """Write `inspection.json`. Returns the `[log]` table as TOML."""
     write_json(folder / "inspection.json", to_jsonable(inspection.to_dict()))
     return tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
 
 
-def describe_inspection(inspection: Inspection) -> Result:
+def describe(inspection: Inspection) -> Result:
     """Say what the log can identify, and what is wrong with it."""
     record, by_answer = inspection.record, {}
     judgements = [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
@@ -89,7 +89,7 @@ def _channel_table(record: Record) -> list[tuple[str, ...]]:
     return rows
 
 
-def draw_inspection(inspection: Inspection) -> list[Figure]:
+def draw(inspection: Inspection) -> list[Figure]:
     """All figures of an inspected log."""
     record = inspection.record
     figures = [_channels(record)]

@@ -19,7 +19,7 @@ from .panels import BLUE, VERMILION, Axis, Figure, Panel, arrange, cloud, mark, 
 from .tune import for_title
 
 
-def draw_loop_tuning(tuning: LoopTuning) -> list[Figure]:
+def draw(tuning: LoopTuning) -> list[Figure]:
     """Draw the error of all candidates over each gain."""
     summary, candidates, panels = tuning.summary, tuning.candidates, []
     metric = find_metric(summary["objective_metric"].split()[0])
@@ -35,7 +35,7 @@ def draw_loop_tuning(tuning: LoopTuning) -> list[Figure]:
     return [Figure("loop_gains", panels, caption, columns, 3.6 * columns, 3.2)]
 
 
-def write_loop_tuning(tuning: LoopTuning, folder: Path) -> str:
+def write(tuning: LoopTuning, folder: Path) -> str:
     """Write `gains.toml` and `tuning.json`. Returns the study's TOML."""
     summary = tuning.summary
     head = (
@@ -47,7 +47,7 @@ def write_loop_tuning(tuning: LoopTuning, folder: Path) -> str:
     return tuning.config.to_toml()
 
 
-def describe_loop_tuning(tuning: LoopTuning) -> Result:
+def describe(tuning: LoopTuning) -> Result:
     """Say by how much the loop is better, and how far each gain is from where it no longer holds."""
     summary, compared = tuning.summary, tuning.summary["compared"]
     name, unit = summary["objective_metric"].split(" ", 1)

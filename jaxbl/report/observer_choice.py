@@ -31,7 +31,7 @@ from .panels import (
 from .tune import error_label, for_title
 
 
-def draw_choice(choice: ObserverChoice) -> list[Figure]:
+def draw(choice: ObserverChoice) -> list[Figure]:
     """Draw each kind's error over the best one's with its interval, over all points, a panel for each side."""
     summary, panels = choice.summary, []
     points = summary["points"]
@@ -80,7 +80,7 @@ def _ratio(result: JsonObject) -> str:
     return ratio if runs_are_equal(result) else f"{ratio} ({low} to {high})"
 
 
-def write_choice(choice: ObserverChoice, folder: Path) -> str:
+def write(choice: ObserverChoice, folder: Path) -> str:
     """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
     summary = choice.summary
     if (gains := observer_toml(summary)) is not None:
@@ -89,7 +89,7 @@ def write_choice(choice: ObserverChoice, folder: Path) -> str:
     return choice.config.to_toml()
 
 
-def describe_choice(choice: ObserverChoice) -> Result:
+def describe(choice: ObserverChoice) -> Result:
     """Say which kind of observer is best, and by how much."""
     config, summary = choice.config, choice.summary
     points, kind = summary["points"], summary.get("for_both_sides")
@@ -166,26 +166,16 @@ def choice_headline(summary: JsonObject) -> Lines:
 
 
 def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
-    points, kinds = summary["points"], summary["observers"]
-    tables = []
-    if len(points) == 1:
-        for side, result in points[0]["sides"].items():
-            rows = [
-                [kind, *(numbers[key] for key in ("error", "worst", *_RATIO)),
-                 ", ".join(f"{key} = {value:.4g}" for key, value in numbers["gains"].items())]
-                for kind, numbers in result["kinds"].items()
-            ]  # fmt: skip
-            columns = ["observer", error_label(summary), "worst run", "times the best", "from", "to", "gains"]
-            tables.append(ResultTable(f"{side}, {_where(summary)}", columns, rows))
-        return tables
-    axes = summary["axes"]
-    for side in points[0]["sides"]:
-        rows = []
-        for point in points:
-            result = point["sides"][side]
-            ratios = ["–" if (numbers := result["kinds"][kind])["ratio"] is None else _ratio(numbers) for kind in kinds]
-            values, tied = (point["values"][path] for path in axes), ", ".join(result["not_told_apart"])
-            rows.append([*values, result["best"] or "none", tied, *ratios])
-        columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
-        tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
+    """A table for each side: every kind at every point."""
+    tables, axes = [], summary["axes"] if len(summary["points"]) > 1 else []
+    head = [*(axis_label(config, path) for path in axes), "observer", error_label(summary), "worst run", "times the best",
+            "from", "to", "gains"]  # fmt: skip
+    for side in summary["points"][0]["sides"]:
+        rows = [
+            [*(point["values"][path] for path in axes), kind, *(numbers[key] for key in ("error", "worst", *_RATIO)),
+             ", ".join(f"{key} = {value:.4g}" for key, value in numbers["gains"].items())]
+            for point in summary["points"]
+            for kind, numbers in point["sides"][side]["kinds"].items()
+        ]  # fmt: skip
+        tables.append(ResultTable(f"{side}, {_where(summary)}", head, rows))
     return tables

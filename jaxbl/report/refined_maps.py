@@ -12,6 +12,9 @@ from scipy.spatial import KDTree
 
 from jaxbl.sweeps.points import Points
 
+# pandas' and SciPy's own annotations are wider than what their methods return
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
+
 Array = np.ndarray
 
 _MOST_SHOWN = 1025

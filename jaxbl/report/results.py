@@ -27,45 +27,42 @@ from jaxbl.sweeps.sweep import StudyResult
 from jaxbl.sweeps.trial import Trial
 from jaxbl.validation import suggest_word
 
-from .compare import describe_comparison, draw_comparison, write_comparison
-from .diagnose import describe_diagnosis, draw_diagnosis, write_diagnosis
+from . import (
+    compare,
+    diagnose,
+    element,
+    identify,
+    inspect,
+    loop_gains,
+    observer_choice,
+    simulate,
+    sweep,
+    tune,
+    verify,
+    watch,
+)
 from .drawing import picture
-from .element import describe_element, draw_element, write_element
-from .identify import describe_identification, write_identification
-from .identify_figures import draw_identification
-from .inspect import describe_inspection, draw_inspection, write_inspection
-from .loop_gains import describe_loop_tuning, draw_loop_tuning, write_loop_tuning
-from .maps import draw as draw_study
-from .observer_choice import describe_choice, draw_choice, write_choice
 from .page import PAGE, write_page
 from .panels import Figure
-from .simulate import describe_trial, draw_trial, write_trial
-from .sweep import describe_sweep, write_sweep
-from .tune import describe_tuning, draw_tuning, write_tuning
-from .verify import describe_verdict, draw_verdict, write_verdict
-from .watch import describe_watch, draw_watch, write_watch
 
 
 class _Kind(NamedTuple):
-    """Functions of one kind of result.
+    """One kind of result.
 
     Attributes:
-        describe: says what was found.
-        draw: draws the figures; the first is the one beside the answer.
-        write: writes the files beside the page into a folder, and returns the study or model that the page shows, as TOML.
+        report: module with `describe`, which says what was found (of logs by the summary), `draw`, which draws the figures
+            (the first is the one beside the answer), and `write`, which writes the files beside the page into a folder and
+            returns the study or model that the page shows, as TOML.
         file: what was found, as data; names the result in the manifest of its folder.
         subject: what the result is about.
     """
 
-    describe: Callable[[Any], Result]
-    draw: Callable[[Any], list[Figure]]
-    write: Callable[[Any, Path], str]
+    report: Any
     file: str = PAGE
     subject: Callable[[Any], Subject] = lambda result: study_subject(result.config)
 
-
-def _of_summary(describe: Callable[[Any], Result]) -> Callable[[Any], Result]:
-    return lambda result: describe(result.summary)
+    def describe(self, result: Any) -> Result:
+        return self.report.describe(result.summary if self.subject is _log else result)
 
 
 def _log(result: Any) -> Subject:
@@ -73,28 +70,18 @@ def _log(result: Any) -> Subject:
 
 
 _KINDS = {
-    Trial: _Kind(describe_trial, draw_trial, write_trial, "summary.json"),
-    StudyResult: _Kind(describe_sweep, draw_study, write_sweep),
-    Tuning: _Kind(describe_tuning, draw_tuning, write_tuning, "tuning.json"),
-    ObserverChoice: _Kind(describe_choice, draw_choice, write_choice, "tuning.json"),
-    LoopTuning: _Kind(describe_loop_tuning, draw_loop_tuning, write_loop_tuning, "tuning.json"),
-    Verdict: _Kind(describe_verdict, draw_verdict, write_verdict),
-    Comparison: _Kind(
-        describe_comparison, draw_comparison, write_comparison, "comparison.json", lambda _: Subject("comparison")
-    ),
-    Inspection: _Kind(
-        describe_inspection,
-        draw_inspection,
-        write_inspection,
-        "inspection.json",
-        lambda result: log_subject(result.record.path),
-    ),
-    Identification: _Kind(
-        _of_summary(describe_identification), draw_identification, write_identification, "identification.json", _log
-    ),
-    ElementIdentification: _Kind(_of_summary(describe_element), draw_element, write_element, "identification.json", _log),
-    Diagnosis: _Kind(_of_summary(describe_diagnosis), draw_diagnosis, write_diagnosis, "diagnosis.json", _log),
-    Watch: _Kind(describe_watch, draw_watch, write_watch, "watch.json", lambda watch: log_subject(Path(watch.task.name))),
+    Trial: _Kind(simulate, "summary.json"),
+    StudyResult: _Kind(sweep),
+    Tuning: _Kind(tune, "tuning.json"),
+    ObserverChoice: _Kind(observer_choice, "tuning.json"),
+    LoopTuning: _Kind(loop_gains, "tuning.json"),
+    Verdict: _Kind(verify),
+    Comparison: _Kind(compare, "comparison.json", lambda _: Subject("comparison")),
+    Inspection: _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path)),
+    Identification: _Kind(identify, "identification.json", _log),
+    ElementIdentification: _Kind(element, "identification.json", _log),
+    Diagnosis: _Kind(diagnose, "diagnosis.json", _log),
+    Watch: _Kind(watch, "watch.json", lambda result: log_subject(Path(result.task.name))),
 }
 
 
@@ -125,7 +112,7 @@ def draw(result: Any, *names: str) -> Drawings:
     Raises:
         InputError: no result of these, or no figure of that name.
     """
-    figures = {figure.name: figure for figure in _kind_of(result).draw(result)}
+    figures = {figure.name: figure for figure in _kind_of(result).report.draw(result)}
     if unknown := [name for name in names if name not in figures]:
         raise InputError(f"no figure '{unknown[0]}'; {suggest_word(unknown[0], figures)}")
     return Drawings(figures[name] for name in names or figures)
@@ -172,8 +159,8 @@ def write_report(result: Any, folder: str | Path | ResultFolder, described: Resu
         # without details, of which one is how long compiling took: the same results have the same manifest
         card = {"title": described.title, "sentences": replace(described, details=()).sentences}
         draft = stack.enter_context(folder.write_files(kind.file, identity=identity, **card))
-        config = kind.write(result, draft)
-        write_page(draft, described, kind.draw(result), config)
+        config = kind.report.write(result, draft)
+        write_page(draft, described, kind.report.draw(result), config)
     return described
 
 

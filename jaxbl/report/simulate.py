@@ -28,14 +28,14 @@ from .panels import (
 )
 
 
-def write_trial(trial: Trial, folder: Path) -> str:
+def write(trial: Trial, folder: Path) -> str:
     """Write trace and summary of a run. Returns the study's TOML."""
     write_json(folder / "summary.json", trial.summary)
     trial.trace.to_parquet(folder / "trace.parquet", index=False)
     return trial.config.to_toml()
 
 
-def describe_trial(trial: Trial) -> Result:
+def describe(trial: Trial) -> Result:
     """Say whether the observers converged, and how large their errors are."""
     summary, metrics, limits = trial.summary, trial.summary["metrics"], trial.config.run
     sides, drive = trial.config.sides, trial.config.drive.build()
@@ -51,12 +51,6 @@ def describe_trial(trial: Trial) -> Result:
     elif metrics["finite"]:
         times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
-        reserves = ", ".join(
-            f"× {judged['largest_f_plus'] / judged['f_plus']:.3g} ({side})" if judged["holds"]["exact"] else f"none ({side})"
-            for side, judged in summary["conditions"].items()
-            if judged["f_plus"]
-        )
-        headline += f" What the gains allow f⁺ to grow: {reserves}." if reserves else ""
     units = {"velocity": "rad/s", "torque": "N m"}
     errors = {(side, quantity): metrics[f"{side}.{quantity}_rmse"] for side in sides for quantity in units}
     largest = {side: limits.velocity_tolerance / drive.ratio(side) for side in sides}
@@ -86,7 +80,7 @@ def describe_trial(trial: Trial) -> Result:
     return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
-def draw_trial(trial: Trial) -> list[Figure]:
+def draw(trial: Trial) -> list[Figure]:
     """All figures of a run."""
     trace, controller = trial.trace, trial.config.controller
     is_geared = trial.config.is_geared

@@ -19,18 +19,19 @@ from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .aggregates import Distinct, Groups, Rows
-from .maps import best_gains, laws_of, slope_text, worst_runs
+from .aggregates import Groups, Rows
+from .checks import values_of
+from .maps import best_gains, draw as draw, laws_of, slope_text, worst_runs
 
 
-def write_sweep(result: StudyResult, folder: Path) -> str:
+def write(result: StudyResult, folder: Path) -> str:
     """Write `laws.json` if figures ask for laws. Returns the study's TOML."""
     if laws := laws_of(result):
         write_json(folder / "laws.json", [law.to_dict() for law in laws])
     return result.config.to_toml()
 
 
-def describe_sweep(result: StudyResult) -> Result:
+def describe(result: StudyResult) -> Result:
     """Say where the observers work, and which gains are best, with tables of axes that matter and of laws."""
     survey, laws = _Survey(result), laws_of(result)
     tables = [_law_table(laws)] * bool(laws)
@@ -92,7 +93,6 @@ class _Survey:
         converged: how many of the even ones converged, by side; none where the study does not say.
         best: the best gains, by side, and the worst runs with each pair of gains; none where the study does not say.
         importance: axes by what they explain of the velocity error, by side; of random designs alone.
-        values: all values of each axis.
     """
 
     def __init__(self, result: StudyResult):
@@ -106,22 +106,22 @@ class _Survey:
         self.runs = self.even = self.diverged = 0
         self.converged = dict.fromkeys(self.sides, 0)
         self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
-        distinct = {path: Distinct() for path in paths}
         for frame in result.batches([*paths, "seed", "finite", *metrics]):
             even = frame if points is None else frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
             self.diverged += int((~frame["finite"].astype(bool)).sum())
-            for path in paths:
-                distinct[path].add(frame[[path]])
             for side in self.sides:
                 self.converged[side] += int(even[f"{side}.converged"].sum())
         errors = {side: f"{side}.velocity_rmse" for side in config.sides}
         ranked = {side: rank_axes(result, error) for side, error in errors.items() if error in metrics}
         self.importance = {side: axes for side, axes in ranked.items() if axes}
-        self.values = {path: values.frame()[path] for path, values in distinct.items()}
         for side in self.sides if config.sweep.design == "grid" else []:
-            gains = [path for path in paths if path.startswith(f"observer.{side}.") and len(self.values[path]) > 1]
+            gains = [
+                axis.path
+                for axis in config.axes
+                if axis.path.startswith(f"observer.{side}.") and values_of(config, axis) > 1
+            ]
             if gains and f"{side}.velocity_rmse" in metrics:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
                 groups = Groups(Rows(result, columns), gains, paths)

@@ -30,7 +30,7 @@ from .panels import (
 )
 
 
-def draw_tuning(tuning: Tuning) -> list[Figure]:
+def draw(tuning: Tuning) -> list[Figure]:
     """All figures of a tuning."""
     return [_map(tuning, side) for side in tuning.config.sides if side in tuning.candidates]
 
@@ -108,7 +108,7 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     return f"error {_size(way['change'])} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
 
 
-def write_tuning(tuning: Tuning, folder: Path) -> str:
+def write(tuning: Tuning, folder: Path) -> str:
     """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
     summary = tuning.summary
     (folder / "gains.toml").write_text(gains_toml(summary), encoding="utf-8")
@@ -117,7 +117,7 @@ def write_tuning(tuning: Tuning, folder: Path) -> str:
     return tuning.config.to_toml()
 
 
-def describe_tuning(tuning: Tuning) -> Result:
+def describe(tuning: Tuning) -> Result:
     """Say which gains to take, whether they matter, and what limits them."""
     summary = tuning.summary
     chosen = "; ".join(

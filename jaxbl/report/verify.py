@@ -25,7 +25,7 @@ _USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 
 
-def draw_verdict(verdict: Verdict) -> list[Figure]:
+def draw(verdict: Verdict) -> list[Figure]:
     """The atlas; the runs of the drive are for `jaxbl explore`."""
     return [_atlas(verdict)]
 
@@ -62,12 +62,12 @@ def _name(level: JsonObject) -> str:
     return ", ".join(level[key] for key in ("level", "side") if level.get(key))
 
 
-def write_verdict(verdict: Verdict, folder: Path) -> str:
+def write(verdict: Verdict, folder: Path) -> str:
     """Return the study's TOML; the command has left the other files."""
     return verdict.config.to_toml()
 
 
-def describe_verdict(verdict: Verdict) -> Result:
+def describe(verdict: Verdict) -> Result:
     """Say whether the study's own gains and the marked ones are safe, and which conditions are wrong."""
     marks, levels, own_gains = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]

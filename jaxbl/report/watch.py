@@ -24,14 +24,14 @@ LABELS = {
 }  # fmt: skip
 
 
-def write_watch(watch: Watch, folder: Path) -> str:
+def write(watch: Watch, folder: Path) -> str:
     """Write `watch.csv` and `watch.json`. Returns the study's TOML."""
     watch.values.to_csv(folder / VALUES, index=False)
     write_json(folder / SUMMARY, watch.summary)
     return tomli_w.dumps(watch.task.config.to_dict())
 
 
-def describe_watch(watch: Watch) -> Result:
+def describe(watch: Watch) -> Result:
     """Say whether the gap has grown beyond its limit, and how large gap and stiffness are."""
     summary, task = watch.summary, watch.task
     last, limit, alarm = (summary[key] for key in ("last", "alarm_gap", "alarm"))
@@ -99,7 +99,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
     yield add
 
 
-def draw_watch(watch: Watch) -> list[Figure]:
+def draw(watch: Watch) -> list[Figure]:
     """Gap, stiffness and friction over time."""
     values, task, limit = watch.values, watch.task, watch.task.alarm_gap
     law = [name for name in ("half_gap", "stiffness") if f"motor.{name}" in values]

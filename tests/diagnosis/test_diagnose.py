@@ -26,7 +26,7 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.logs import SealedRecord
 from jaxbl.files import read_result
 from jaxbl.records import read_record
-from jaxbl.report.diagnose import describe_diagnosis
+from jaxbl.report.diagnose import describe as describe_diagnosis
 from jaxbl.report.results import write_report
 
 FIRST_PART, LAST_PART = slice(1500), slice(1500 - DELAY_SAMPLES, 2000)

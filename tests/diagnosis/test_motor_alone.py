@@ -15,7 +15,7 @@ from jaxbl.diagnosis.motor_alone import list_sought
 from jaxbl.diagnosis.next_experiment import with_gap
 from jaxbl.drive.effects import DELAY_SAMPLES
 from jaxbl.estimation import motor_alone
-from jaxbl.report.diagnose import describe_diagnosis
+from jaxbl.report.diagnose import describe as describe_diagnosis
 from jaxbl.report.results import write_report
 
 STUDY = {

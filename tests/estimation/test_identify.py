@@ -20,7 +20,7 @@ from jaxbl.estimation.identify import identify
 from jaxbl.estimation.logs import default_paths
 from jaxbl.estimation.search import ParameterSearch
 from jaxbl.observer.conditions import least_lambda_exact
-from jaxbl.report.identify import describe_identification
+from jaxbl.report.identify import describe as describe_identification
 from jaxbl.report.results import write_report
 
 LAW = {"law": "dead_zone", "stiffness": 60.0, "half_gap": 0.08}

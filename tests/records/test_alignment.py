@@ -5,7 +5,7 @@ import pytest
 from measured import NOMINAL, simulate_axis
 
 from jaxbl.records import NominalDrive, inspect, read_record
-from jaxbl.report.inspect import describe_inspection
+from jaxbl.report.inspect import describe as describe_inspection
 
 
 @pytest.fixture

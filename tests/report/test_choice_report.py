@@ -11,7 +11,7 @@ from test_page import Page
 
 from jaxbl.gains.tune import tune
 from jaxbl.report.drawing import save
-from jaxbl.report.observer_choice import choice_headline, draw_choice
+from jaxbl.report.observer_choice import choice_headline, draw as draw_choice
 from jaxbl.report.panels import Line
 from jaxbl.report.results import describe, draw, write_report
 

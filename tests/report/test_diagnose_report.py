@@ -10,7 +10,7 @@ from panel_parts import names_of
 from passed import PASSED
 
 from jaxbl.diagnosis.residuals import Residual
-from jaxbl.report.diagnose import _over_time, describe_diagnosis
+from jaxbl.report.diagnose import _over_time, describe as describe_diagnosis
 from jaxbl.report.drawing import save
 
 ERRORS = {

@@ -11,7 +11,7 @@ from test_page import Page
 
 from jaxbl.records import inspect
 from jaxbl.report.drawing import save
-from jaxbl.report.inspect import draw_inspection
+from jaxbl.report.inspect import draw as draw_inspection
 from jaxbl.report.results import describe, write_report
 from jaxbl.result import format_result
 

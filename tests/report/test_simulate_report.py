@@ -4,7 +4,7 @@ import pytest
 from small_study import rigid_study, small_study
 
 from jaxbl.report.drawing import save
-from jaxbl.report.simulate import draw_trial
+from jaxbl.report.simulate import draw as draw_trial
 from jaxbl.sweeps.trial import run
 
 AT_REST = ["torque", "motor_velocity", "load_velocity", "hysteresis"]

@@ -17,7 +17,7 @@ from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
 from jaxbl.report.panels import Map
 from jaxbl.report.results import describe, write_report
-from jaxbl.report.tune import _size, draw_tuning
+from jaxbl.report.tune import _size, draw as draw_tuning
 from jaxbl.sweeps.trial import run
 
 SLOW_GAINS = {"lambda": 1e-3, "alpha": 0.05}

@@ -13,7 +13,7 @@ from shared_results import VERIFY_STUDY
 from jaxbl.config import read_config
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.report.results import write_report
-from jaxbl.report.verify import describe_verdict, draw_verdict
+from jaxbl.report.verify import describe as describe_verdict, draw as draw_verdict
 from jaxbl.sweeps.engine import Engine
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, spaced_axis
 
-from jaxbl.report.compare import draw_comparison
+from jaxbl.report.compare import draw as draw_comparison
 from jaxbl.report.results import describe
 from jaxbl.sweeps.compare import compare
 

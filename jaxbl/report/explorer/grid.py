@@ -157,7 +157,7 @@ def _stars(
     stars = []
     for index in [telling[:-1], *(index for index in np.ndindex(*shape[:-3]) if index != telling[:-1])][:64]:
         frame = runs.assign(**{name: cells[name][index].ravel() for name in needed})
-        if frame[["finite", f"{side}.converged"]].isna().any(axis=None):
+        if frame[["finite", f"{side}.converged"]].isna().to_numpy().any():
             continue
         worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first, f"{side}.margin_alpha" in needed)
         if (best := best_gains(worst)) is not None:
