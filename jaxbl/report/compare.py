@@ -89,8 +89,6 @@ def describe(comparison: Comparison) -> Result:
         gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
         if gone:
             remarks.append(f"A number in {study} alone: {', '.join(gone)}.")
-    same = [change.metric for change in comparison.metrics if change not in changed]
-    details = [f"No difference beyond {beyond}: {', '.join(same)}."] if same else []
     figures = [KeyFigure(_factor(change), f"{change.metric}: {_ways(change)}") for change in changed[:4]]
     rows = [[key, _value(old), _value(new)] for key, (old, new) in comparison.config.items()]
     tables = [ResultTable("What differs in the config", ["key", *names], rows)] * bool(rows)
@@ -101,7 +99,7 @@ def describe(comparison: Comparison) -> Result:
             for change in changed
         ]
         tables.append(ResultTable("Metrics that differ", head, rows))
-    return Result(f"{names[0]} and {names[1]}", verdict, headline, figures, remarks, details, tables)
+    return Result(f"{names[0]} and {names[1]}", verdict, headline, figures, remarks, tables=tables)
 
 
 def _noise(comparison: Comparison) -> str:

@@ -87,7 +87,7 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
         side: motor or load.
         judged: gains, f⁺ and what follows from them, as of :func:`jaxbl.observer.conditions.judge_gains`.
     """
-    lambda_, alpha, bound, largest = (judged[key] for key in _GAINS)
+    lambda_, alpha, bound, _ = (judged[key] for key in _GAINS)
     least = judged["least_lambda"]["exact"]
     # a gain of zero has no place on a logarithmic axis
     alphas = min(0.7 * bound, 0.5 * alpha or bound), max(20.0 * bound, 3.0 * alpha)
@@ -98,19 +98,11 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
     x, y = [alphas[0], exact.x[0], *exact.x], [lambdas[1], lambdas[1], *exact.y]
     parts = [Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6), exact._replace(colour="#000000")]
     parts.append(usual_rule_curve(bound, alphas))
-    if largest > 0.0:
-        _, edge = condition_curves(EXACT, largest, alphas)
-        name = f"where it would fail at f⁺ = {largest:.3g} rad/s²"
-        parts.append(Line([edge.x[0], *edge.x], [lambdas[1], *edge.y], name, width=1.2, dashes="--"))
-    if least is not None:
-        parts.append(Line([alpha, alpha], [least, max(lambda_, lambdas[0])], width=1.2))
     parts.append(mark(alpha, lambda_, "the observer's gains"))
     caption = (
         f"Gains of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) and the least λ of the exact "
         f"condition at the true f⁺ = {bound:.3g} rad/s² along the run; the usual rule's gains for this f⁺ and larger ones. "
         "Above and on the right: the axes of the atlas (jaxbl verify)."
     )
-    if least is not None and lambda_ > 0.0:
-        caption += f" Stroke: λ is {lambda_ / least:.3g} times the least one of the exact condition."
     panel = Panel(*gain_axes(bound, alphas, lambdas), parts, title=f"{side} observer")
     return Figure(f"gain_conditions_{side}", [panel], caption, width=5.6, height=4.4)

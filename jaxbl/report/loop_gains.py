@@ -7,7 +7,6 @@ from pathlib import Path
 
 import tomli_w
 
-from jaxbl.files import write_json
 from jaxbl.gains.counterexamples import set_keys
 from jaxbl.gains.loop_gains import LoopTuning
 from jaxbl.json_types import JsonObject
@@ -16,7 +15,7 @@ from jaxbl.sweeps.metrics import find_metric
 
 from .maps import axis_label
 from .panels import BLUE, VERMILION, Axis, Figure, Panel, arrange, cloud, mark, with_unit
-from .tune import for_title
+from .tune import for_title, write_gains
 
 
 def draw(tuning: LoopTuning) -> list[Figure]:
@@ -42,9 +41,7 @@ def write(tuning: LoopTuning, folder: Path) -> str:
         f"# Gains of a loop chosen by 'jaxbl tune'{for_title(summary)}\n# Objective: {summary['objective_metric']}.\n"
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n'
     )
-    (folder / "gains.toml").write_text(head + tomli_w.dumps(set_keys({}, summary["gains"])), encoding="utf-8")
-    write_json(folder / "tuning.json", summary, allow_nan=False)
-    return tuning.config.to_toml()
+    return write_gains(tuning, folder, head + tomli_w.dumps(set_keys({}, summary["gains"])))
 
 
 def describe(tuning: LoopTuning) -> Result:

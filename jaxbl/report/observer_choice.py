@@ -10,7 +10,6 @@ import numpy as np
 import tomli_w
 
 from jaxbl.config import Config
-from jaxbl.files import write_json
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
@@ -28,7 +27,7 @@ from .panels import (
     name_rows,
     place_words,
 )
-from .tune import error_label, for_title
+from .tune import error_label, for_title, write_gains
 
 
 def draw(choice: ObserverChoice) -> list[Figure]:
@@ -82,11 +81,7 @@ def _ratio(result: JsonObject) -> str:
 
 def write(choice: ObserverChoice, folder: Path) -> str:
     """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
-    summary = choice.summary
-    if (gains := observer_toml(summary)) is not None:
-        (folder / "gains.toml").write_text(gains, encoding="utf-8")
-    write_json(folder / "tuning.json", summary, allow_nan=False)
-    return choice.config.to_toml()
+    return write_gains(choice, folder, observer_toml(choice.summary))
 
 
 def describe(choice: ObserverChoice) -> Result:

@@ -370,13 +370,10 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         } | ({"names": [[place, text.replace("\n", ", ")] for place, text in axis.names]} if axis.names else {})  # fmt: skip
     content |= {kind: [] for kind in ("lines", "bands", "spans")}
     for part in map(thin, panel.parts):
-        if isinstance(part, Line):
-            look = {key: getattr(part, key) for key in ("name", "colour", "width", "dashes", "marker", "opacity")}
-            content["lines"].append(look | {"x": packed(part.x), "y": packed(part.y), "sorted": part.is_sorted})
-        elif isinstance(part, Band):
-            content["bands"].append(part._asdict() | {key: packed(getattr(part, key)) for key in ("x", "low", "high")})
-        elif isinstance(part, Span):
-            content["spans"].append(part._asdict())
+        if isinstance(part, Line | Band | Span):
+            curves = {key: packed(values) for key, values in part._asdict().items() if key in ("x", "y", "low", "high")}
+            fields = part._asdict() | (curves if not isinstance(part, Span) else {})
+            content[f"{type(part).__name__.lower()}s"].append(fields | {"sorted": isinstance(part, Line) and part.is_sorted})
         elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
             cells = {key: packed(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
             scale = part.scale._asdict()

@@ -2,6 +2,7 @@
 
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -110,10 +111,15 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
 
 def write(tuning: Tuning, folder: Path) -> str:
     """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
-    summary = tuning.summary
-    (folder / "gains.toml").write_text(gains_toml(summary), encoding="utf-8")
-    write_certificates(summary, folder)
-    write_json(folder / "tuning.json", summary, allow_nan=False)
+    write_certificates(tuning.summary, folder)
+    return write_gains(tuning, folder, gains_toml(tuning.summary))
+
+
+def write_gains(tuning: Any, folder: Path, gains: str | None) -> str:
+    """Write what `jaxbl tune` found, and gains as TOML, if there are any. Returns the study's TOML."""
+    if gains is not None:
+        (folder / "gains.toml").write_text(gains, encoding="utf-8")
+    write_json(folder / "tuning.json", tuning.summary, allow_nan=False)
     return tuning.config.to_toml()
 
 
