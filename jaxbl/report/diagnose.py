@@ -295,26 +295,16 @@ def _history_table(summary: JsonObject) -> ResultTable:
 
 
 def _gap_table(gap: JsonObject) -> ResultTable:
-    control, units = gap["controls"].get("wrong"), gap["units"]
-    limits = {name: error["limit"] for name, error in gap["expected"].items()}
+    units, limits = gap["units"], {name: error["limit"] for name, error in gap["expected"].items()}
     rows: list[list[Any]] = [
-        [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name]]
-        + [error.get(name) for error in (limits, *([control["rmse"]] if control else []))]
+        [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], limits.get(name)]
         for name, before in gap["holdout_rmse_before"].items()
     ]
     for name, torque in gap.get("slow_torques", {}).items():
         channel, _, below = name.partition(" ")
         numbers = (torque[key] for key in ("before", "after", "noise", "limit"))
-        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers, *([None] if control else [])])
-    head = [
-        "channel",
-        "unit",
-        "before",
-        "after",
-        "noise",
-        "complete model at most",
-        *([control["effect"]] if control else []),
-    ]
+        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers])
+    head = ["channel", "unit", "before", "after", "noise", "complete model at most"]
     return ResultTable("Held-out data, rms", head, rows)
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import tomli_w
 
 from jaxbl.files import to_jsonable, write_json
-from jaxbl.lines import percent
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -54,7 +53,7 @@ def describe(inspection: Inspection) -> Result:
         if answer in by_answer
     ]
     verdict = "good" if "yes" in by_answer else "doubtful" if by_answer.keys() - {"no"} else "no answer"
-    (head, *rows), sampling = _channel_table(record), record.statistics.sampling
+    sampling = record.statistics.sampling
     stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
     count = len(record.segments)
     span = float(sum(np.ptp(record.time[part]) for part in record.segments)) + count * record.sample_period
@@ -70,23 +69,21 @@ def describe(inspection: Inspection) -> Result:
     ]
     tables = [
         ResultTable("What the log can identify", ["quantity", "", "why"], judgements),
-        ResultTable("Channels", head, rows),
+        _channel_table(record),
     ]
     remarks, headline = [*record.warnings, inspection.describe_sizes()], f"The log {'; it '.join(parts)}."
     return lead_with_doubt(Result(record.path.name, verdict, headline, figures, remarks, record.notes, tables))
 
 
-def _channel_table(record: Record) -> list[tuple[str, ...]]:
-    """Header and rows of the table of channels."""
-    rows = [("channel", "unit", "least", "largest", "resolution", "noise", "bandwidth", "saturated", "jumps", "skew")]
+def _channel_table(record: Record) -> ResultTable:
+    columns = ["channel", "unit", "least", "largest", "resolution", "noise", "bandwidth (Hz)", "saturated", "jumps",
+               "skew (ms)", "standard error"]  # fmt: skip
+    rows = []
     for name, c in record.statistics.channels.items():
-        skew = "–" if c.skew is None or c.skew_error is None else f"{1e3 * c.skew:.2g} ± {1e3 * c.skew_error:.1g} ms"
-        rows.append((
-            name, c.unit, f"{c.least:.4g}", f"{c.largest:.4g}", f"{c.resolution:.3g}" if c.resolution else "–",
-            f"{c.noise:.2g}", f"{c.bandwidth:.3g} Hz" if c.bandwidth else "–",
-            percent(c.saturated) if c.saturated else "–", str(c.jumps) if name.startswith("theta") else "–", skew,
-        ))  # fmt: skip
-    return rows
+        skew = [None if seconds is None else 1e3 * seconds for seconds in (c.skew, c.skew_error)]
+        positions = c.jumps if name.startswith("theta") else None
+        rows.append([name, *(getattr(c, key) for key in columns[1:6]), c.bandwidth, c.saturated, positions, *skew])
+    return ResultTable("Channels", columns, rows)
 
 
 def draw(inspection: Inspection) -> list[Figure]:

@@ -116,7 +116,6 @@ def observer_toml(summary: JsonObject) -> str | None:
     lines = [
         f"# Observer chosen by 'jaxbl tune'{for_title(summary)}",
         f"# Objective: {summary['objective_metric']}, among {', '.join(summary['observers'])}.",
-        *(f"# {side}: {result['ratio']:.3g} times the error of the best kind there." for side, result in sides.items()),
         '# To use it, put include = "gains.toml" at the top of a study and leave its own [observer] out.',
         "",
     ]

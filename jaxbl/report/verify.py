@@ -99,10 +99,6 @@ def describe(verdict: Verdict) -> Result:
         for margin, name in margins[:4]
         if margin
     ]
-    figures = figures or [
-        KeyFigure(f"{entry['counterexamples']} of {entry['holds']}", f"{_name(level)}: failed though the condition held")
-        for level, entry in exact[:4]
-    ]
     tables = [_level_table(level) for level in levels]
     if marks:
         tables.insert(0, _mark_table(marks))
