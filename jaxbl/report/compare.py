@@ -28,8 +28,7 @@ from .panels import (
 )
 
 _ROWS = 12
-"""Share of points up to which a map of where a metric changed would be empty."""
-"""Factor within which a change is the same everywhere: a map of it would have one colour."""
+"""Metrics of the figure."""
 
 
 def write(comparison: Comparison, folder: Path) -> str:

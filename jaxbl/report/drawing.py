@@ -71,7 +71,8 @@ _INK = (
 )  # fmt: skip
 """Colours of a drawing that follow the page's."""
 _DARK = """svg { color: #000000; --paper: #ffffff; --back: #ffffff; --grid: #dddddd; fill: currentColor }
-@media (prefers-color-scheme: dark) { svg { color: #e8e8ea; --paper: transparent; --back: #17181b; --grid: #43464c } }
+@media (prefers-color-scheme: dark) { svg { color: #e8e8ea; --paper: transparent; --back: #17181b; --grid: #43464c }
+  .cloud { filter: brightness(1.9) } }
 </style>"""
 _LETTER, _ROW, _KEY = 0.075, 0.19, 0.5
 """Width of a letter of a legend, height of a row, and width of what stands before a name, inches."""
@@ -135,6 +136,9 @@ def picture(figure: Figure, path: Path | None = None) -> Picture:
     svg = file.getvalue().decode()
     for colour, follows in _INK:
         svg = svg.replace(f": {colour}", f": {follows}")
+    if not _scales(figure.panels):
+        # dots that are drawn as an image, which cannot follow the page's colours
+        svg = svg.replace("<image ", '<image class="cloud" ')
     panels, texts = [], [figure.caption]
     for ax, panel in zip(axes, figure.panels, strict=True):
         place, ends = ax.get_position(), (ax.get_xlim(), ax.get_ylim())

@@ -96,7 +96,7 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
     _, exact = condition_curves(EXACT, bound, alphas)
     # α has to exceed f⁺, whatever λ is
     x, y = [alphas[0], exact.x[0], *exact.x], [lambdas[1], lambdas[1], *exact.y]
-    parts = [Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6), exact._replace(colour="#000000")]
+    parts = [Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6), exact._replace(colour="#000000", at_line=False)]
     parts.append(usual_rule_curve(bound, alphas))
     parts.append(mark(alpha, lambda_, "the observer's gains"))
     caption = (

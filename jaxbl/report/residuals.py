@@ -30,8 +30,6 @@ from .panels import (
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
 """Coordinates that are drawn: as many as are wide enough side by side."""
-"""Characters of a line above a figure."""
-"""Least share of the power of a peak with a label; labels of smaller ones would cover each other."""
 
 
 def torque_parts(residual: Residual, bandwidth: float, name: str, *, noise: bool = True, **how: Any) -> list[Part]:

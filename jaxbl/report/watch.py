@@ -1,11 +1,11 @@
 """What `jaxbl watch` leaves: values over time as CSV, a summary, one figure, and a page."""
 
-import csv
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import tomli_w
 
 from jaxbl.files import catch_write_errors, write_json
@@ -88,12 +88,9 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
 
     def add(values: JsonObject) -> None:
         nonlocal mode
-        nothing = {name: "" for name, value in values.items() if isinstance(value, float) and np.isnan(value)}
-        with catch_write_errors(folder), (folder / VALUES).open(mode, newline="", encoding="utf-8") as file:
-            out = csv.DictWriter(file, watch_columns(task))
-            if mode == "w":
-                out.writeheader()
-            out.writerow(dict(values) | nothing)
+        row = pd.DataFrame([values], columns=watch_columns(task))
+        with catch_write_errors(folder):
+            row.to_csv(folder / VALUES, mode=mode, header=mode == "w", index=False)
         mode = "a"
 
     yield add
