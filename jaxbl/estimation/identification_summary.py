@@ -155,6 +155,10 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
             "profile": np.column_stack([profile.values, profile.deviance]),
         }
     parameters |= _derive_numbers(fitted, search_fit)
+    finer = (
+        f"The fit has {search_fit.steps} plant steps a sample: with {fitted.run.substeps}, as in the study ([run]), numbers "
+        "would be off by more than a tenth of their standard errors."
+    )
     residual = {
         side: describe_position(record, side, noise[side], rms=noise[side] * rms(search_fit.fit.residual[:, :, i]))
         for i, side in enumerate(side for side in fitted.sides if side in noise)
@@ -172,18 +176,8 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
         "residual": residual,
         "steps": search_fit.steps,
         "rejected": None if all(map(is_noise, residual.values())) else {"lacks": None},
-        "notes": [*record.notes, *_step_note(search_fit, fitted.run.substeps)],
+        "notes": [*record.notes, *([finer] if search_fit.steps != fitted.run.substeps else [])],
     }
-
-
-def _step_note(search_fit: SearchFit, study_steps: int) -> list[str]:
-    """A sentence about plant steps that are finer than the study's."""
-    if search_fit.steps == study_steps:
-        return []
-    return [
-        f"The fit has {search_fit.steps} plant steps a sample: with {study_steps}, as in the study ([run]), numbers would "
-        "be off by more than a tenth of their standard errors."
-    ]
 
 
 def mark_lacking(summary: JsonObject, lacking: MotionShare | None) -> None:

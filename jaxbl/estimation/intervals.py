@@ -184,35 +184,28 @@ def profile(
     The likelihood counts residuals as many times as they are independent: its curvature is that of the covariance of
     :func:`spread`.
     """
-    count = len(free)
     centre, covariance = best.theta, width.covariance
-    deviation = np.sqrt(np.diag(covariance))
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
     worth = float(width.variance) * width.inflation**2
 
-    places = np.repeat(np.arange(count), 2)
-    sign = np.tile([-1.0, 1.0], count)
-    steps = np.sqrt(LIMIT) * deviation[places]
-    directions = covariance[:, places].T / np.diag(covariance)[places, None]
-    points = [[(0.0, 0.0)] for _ in places]
-    for _ in range(_PASSES):
-        steps = np.minimum(steps, _FURTHEST)
-        thetas = centre[None, :] + (sign * steps)[:, None] * directions
-        held = np.eye(count, dtype=bool)[places]
-        tries = [
-            fit(experiment, free, windows, theta, _MOST_STEPS, still) for theta, still in zip(thetas, held, strict=True)
-        ]
-        cost, ends = np.array([end.cost for end in tries]), np.array([end.theta for end in tries])
-        deviance = 2.0 * (cost - float(best.cost)) / worth[places]
-        for i, value in enumerate(deviance):
-            points[i].append((float(steps[i]), float(value)))
-        # start the next fits where these ended
-        directions = (ends - centre[None, :]) / (sign * steps)[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factor = np.sqrt(LIMIT / np.maximum(deviance, 0.0))
-        steps = steps * np.clip(np.where(np.isfinite(factor), factor, 0.3), 0.3, 3.0)
+    def follow(i: int, sign: float) -> _Points:
+        step, direction = np.sqrt(LIMIT * covariance[i, i]), covariance[:, i] / covariance[i, i]
+        points = [(0.0, 0.0)]
+        for _ in range(_PASSES):
+            step = min(step, _FURTHEST)
+            theta = centre + sign * step * direction
+            end = fit(experiment, free, windows, theta, _MOST_STEPS, np.arange(len(free)) == i)
+            deviance = 2.0 * (end.cost - best.cost) / worth[i]
+            points.append((float(step), float(deviance)))
+            # the next fit starts where this one ended
+            direction = (end.theta - centre) / (sign * step)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                factor = np.sqrt(LIMIT / np.maximum(deviance, 0.0))
+            step *= np.clip(factor if np.isfinite(factor) else 0.3, 0.3, 3.0)
+        return points
+
     return {
-        parameter.path: _gather_profile(parameter, centre[i], points[2 * i], points[2 * i + 1])
+        parameter.path: _gather_profile(parameter, centre[i], follow(i, -1.0), follow(i, 1.0))
         for i, parameter in enumerate(free)
     }
 

@@ -46,22 +46,20 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     columns |= {POSITION_CHANNELS[side]: record.positions[side] for side in fitted.sides}
     if record.transmitted is not None:
         columns["transmitted"] = record.transmitted
-    count = len(record.time)
-    for side in fitted.sides:
-        columns |= join_columns(count, segments, [motion_columns(segment, side) for segment in segments])
-    rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)[None, :]).ravel()
-    for i, side in enumerate(fitted.sides):
-        column = np.full(count, np.nan)
-        column[rows] = float(search_fit.windows.noise[side]) * search_fit.fit.residual[:, :, i].ravel()
-        columns[f"{side}.residual"] = column
-    pieces = []
+    pieces: list[NamedArrays] = []
     for segment in segments:
+        piece: NamedArrays = {}
+        for side in fitted.sides:
+            piece |= motion_columns(segment, side)
         deviation = {side: smoothed.deviation(1) for side, smoothed in segment.smoothed.items()}
-        torques = model_torques(fitted, segment.kinematics, deviation)
-        pieces.append(
-            {"torque" if name == "transmission" else f"{name}.effects": values for name, values in torques.items()}
-        )
-    return columns | join_columns(count, segments, pieces)
+        for name, torque in model_torques(fitted, segment.kinematics, deviation).items():
+            piece["torque" if name == "transmission" else f"{name}.effects"] = np.asarray(torque)
+        pieces.append(piece)
+    rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)).ravel()
+    for i, side in enumerate(fitted.sides):
+        column = columns[f"{side}.residual"] = np.full(len(record.time), np.nan)
+        column[rows] = float(search_fit.windows.noise[side]) * search_fit.fit.residual[:, :, i].ravel()
+    return columns | join_columns(len(record.time), segments, pieces)
 
 
 @jit

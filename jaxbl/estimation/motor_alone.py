@@ -240,7 +240,6 @@ def gap_summary(alone: Alone) -> JsonObject | None:
         "gain": gap.gain,
         "needed": SHOWN,
         "crossings": gap.crossings,
-        "starts": gap.starts,
         "why": alone.reason or None,
     }
 

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -94,51 +95,50 @@ def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarra
     return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
 
 
+@dataclass(frozen=True)
 class ParameterSearch:
     """Search of one log's numbers.
 
-    Args:
+    Attributes:
         experiment: the nominal model, with array leaves; its sample period is that of the log.
         segments: of the log.
         settings: `[identify]` of the study.
         at_rest: whether the log begins at rest.
         name: of the log, for messages.
-
-    Raises:
-        InputError: windows of a length that the log does not allow.
     """
 
-    def __init__(
-        self, experiment: Experiment, segments: Sequence[Segment], settings: IdentifyTable, *, at_rest: bool, name: str
-    ):
-        self.experiment, self.segments, self.settings, self.at_rest, self.name = (
-            experiment,
-            segments,
-            settings,
-            at_rest,
-            name,
-        )
-        shortest, longest = min(map(len, segments)), max(map(len, segments))
-        period = segments[0].period
+    experiment: Experiment
+    segments: Sequence[Segment]
+    settings: IdentifyTable
+    at_rest: bool
+    name: str
+
+    @cached_property
+    def lengths(self) -> list[int]:
+        """Samples of the windows that are tried.
+
+        Raises:
+            InputError: windows of a length that the log does not allow.
+        """
+        settings, period = self.settings, self.segments[0].period
+        shortest, longest = (of(map(len, self.segments)) for of in (min, max))
         if settings.window is None:
             short = min(_SHORT, shortest // 2)
-            self.lengths = [short, min(_LONG, max(shortest // 2, short))]
-            if settings.method == "prediction_error":
-                self.lengths = self.lengths[1:]
-        else:
-            asked = round(settings.window / period)
-            if not _FEWEST <= asked <= longest:
-                raise InputError(
-                    f"identify.window: {settings.window:g} s are {asked} samples; it should be between {_FEWEST} samples "
-                    f"({_FEWEST * period:g} s) and the log's longest part ({longest * period:g} s)"
-                )
-            self.lengths = [asked]
+            lengths = [short, min(_LONG, max(shortest // 2, short))]
+            return lengths[1:] if settings.method == "prediction_error" else lengths
+        asked = round(settings.window / period)
+        if not _FEWEST <= asked <= longest:
+            raise InputError(
+                f"identify.window: {settings.window:g} s are {asked} samples; it should be between {_FEWEST} samples "
+                f"({_FEWEST * period:g} s) and the log's longest part ({longest * period:g} s)"
+            )
+        return [asked]
 
     def run(self, free: tuple[FreeParameter, ...]) -> SearchFit:
         """Fit; of directions that the record does not show, one number at a time is taken out.
 
         Raises:
-            InputError: the model diverges.
+            InputError: the model diverges, or windows are of a length that the log does not allow.
         """
         theta, starts = self._coarse(free)
         fitted = np.ones(len(free), bool)

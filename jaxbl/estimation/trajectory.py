@@ -35,9 +35,6 @@ RIDGE = 1e-10
 """Least damping of a search for initial states, over the columns' squares: above rounding, below what it changes."""
 INFLUENCE = 1e-20
 """Of a state, over that of the one with the most: what is below is none (an effect that does nothing)."""
-_SETTLED = 1e-9
-"""Share of its sum of squares that a further step of a window's search may promise where it ends: rounding is 1e-15, what
-decides is 1e-2."""
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _GAINED = 1.0
@@ -71,7 +68,7 @@ class Windows(eqx.Module):
     finer: Residuals
     gain: dict[str, Float[np.ndarray, " 2"]] | None = None
 
-    def only(self, places: np.ndarray) -> "Windows":
+    def only(self, places: np.ndarray | slice) -> "Windows":
         """Some of the windows."""
         # by NumPy: without a compiled program for each length
         columns, common = eqx.partition(self, _IN_COLUMNS)
@@ -133,20 +130,13 @@ def _differentiate(
     experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, windows: Windows, states: PlantState
 ) -> np.ndarray:
     """Derivative of the residuals by theta and the initial states, shape (windows, samples, sides, parameters + states)."""
-    slopes = []
-    most = max(_AT_ONCE // windows.torque.shape[1], 1)
-    for first in range(0, len(windows.time), most):
-        part = np.arange(first, min(first + most, len(windows.time)))
-        piece = jax.tree.map(lambda leaf, part=part: leaf[part], states)
-        slopes.append(_differentiate_some(experiment, free, theta, windows.only(part), piece))
-    return np.concatenate(slopes)
-
-
-def _differentiate_some(
-    experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, windows: Windows, states: PlantState
-) -> np.ndarray:
-    shape, count = jax.tree.structure(states), len(jax.tree.leaves(states))
     runs, samples = windows.torque.shape
+    each = max(_AT_ONCE // samples, 1)
+    if runs > each:
+        parts = [slice(first, first + each) for first in range(0, runs, each)]
+        pieces = [(windows.only(part), jax.tree.map(lambda leaf, part=part: leaf[part], states)) for part in parts]
+        return np.concatenate([_differentiate(experiment, free, theta, *piece) for piece in pieces])
+    shape, count = jax.tree.structure(states), len(jax.tree.leaves(states))
     ways = [Direction(numbers={number.path: float(number.slope(x))}) for number, x in zip(free, theta, strict=False)]
     ways += [Direction(state=row) for row in np.eye(count).tolist()]
     time = windows.time[:, None] + float(experiment.run.sample_period) * np.arange(samples)
@@ -171,102 +161,57 @@ def _differentiate_some(
     return -slopes.transpose(1, 0, 2, 3) / noise[:, None]
 
 
-class Starts(NamedTuple):
-    """Windows of a model from the initial states that suit them best.
-
-    Attributes:
-        start: shape (windows, states).
-        residual: from there over the noise, shape (windows, samples, sides).
-        slope: its derivative by the initial states that are fitted, 0 by others; shape (windows, samples, sides, states).
-        states: along the windows, leaves of shape (windows, samples).
-    """
+class _Eliminated(NamedTuple):
+    """Initial states of windows, shape (windows, states), the residuals from there, an orthonormal basis of what those
+    states can explain, shape (windows, samples times sides, states), and the states along the windows."""
 
     start: np.ndarray
     residual: np.ndarray
-    slope: np.ndarray
+    basis: np.ndarray
     states: PlantState
 
 
-def seek_starts(
-    experiment: Experiment,
-    windows: Windows,
-    passes: int,
-    at_rest: bool,
-    fitted_samples: int | None = None,
-    known_before: np.ndarray | bool = False,
-) -> Starts:
-    """Seek the initial states of windows by damped Gauss-Newton.
+def _eliminate(experiment: Experiment, windows: Windows, passes: int, at_rest: bool) -> _Eliminated:
+    """Initial states of windows by damped Gauss-Newton, and a basis of what they can explain.
 
     The best of all states tried counts: at a hard gap, or where dry friction holds, a full step often makes things worse.
-
-    Args:
-        experiment: with as many plant steps in a sample as it needs.
-        windows: with a guess.
-        passes: initial states that are tried for a window at most.
-        at_rest: whether standstill is one of them.
-        fitted_samples: of a window that they are fitted to; all if left out.
-        known_before: whether what was before a window is known, so that an effect's state follows; shape (windows,).
+    With `at_rest`, standstill is tried as well.
     """
     leaves, shape = jax.tree.flatten(windows.start)
     places: Any = shape.unflatten(range(len(leaves)))
-    (runs, samples), count = windows.torque.shape, len(leaves)
-    best = np.stack([np.broadcast_to(leaf, runs) for leaf in leaves], axis=1).astype(float)
-    moving = [places.velocity[side] for side in experiment.sides]
-    still, fitted = best.copy(), np.ones_like(best)
+    guess, moving = np.stack(leaves, axis=1).astype(float), list(places.velocity.values())
+    still, fitted = guess.copy(), np.ones_like(guess)
     still[:, moving] = 0.0
     fitted[np.ix_(np.flatnonzero(windows.at_rest), moving)] = 0.0
+    # others follow from numbers that are still to be found
     for effect, state in zip(experiment.effects, places.effects, strict=True):
-        # others follow from numbers that are still to be found
-        is_known = effect.state_from_input | (known_before & effect.state_from_measurement)
-        fitted[np.ix_(np.flatnonzero(np.broadcast_to(is_known, runs)), jax.tree.leaves(state))] = 0.0
-    residual = np.zeros((runs, samples, len(moving)))
-    slope, states = np.zeros((*residual.shape, count)), [np.zeros((runs, samples)) for _ in leaves]
-    following, going = best.copy(), np.ones(runs, bool)
+        if effect.state_from_input:
+            fitted[:, jax.tree.leaves(state)] = 0.0
+    runs, following, best = len(guess), guess, None
     damping, cost = np.full(runs, RIDGE), np.full(runs, np.inf)
     for i in range(passes):
-        if at_rest and i == passes // 2 + 1:
+        states = simulate_windows(experiment, windows, shape.unflatten(list(following.T)))
+        value = _leave(experiment, windows, states)
+        slope = _differentiate(experiment, (), np.empty(0), windows, states) * fitted[:, None, None]
+        squares = np.sum(value**2, axis=(1, 2))
+        better = (squares < cost) | ~np.isfinite(cost)
+        damping = np.where(better, np.maximum(0.01 * damping, RIDGE), np.maximum(30.0 * damping, 1e-2))
+        new = following, value, slope, squares, states
+        best = new if best is None else jax.tree.map(partial(_choose, better), new, best)
+        start, value, slope, cost, states = best
+        flat = slope.reshape(runs, -1, guess.shape[1])
+        size = np.sqrt(np.sum(flat**2, axis=1))
+        # a state without influence stays where it is
+        size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
+        unit = flat / size[:, None]
+        matrix = unit.swapaxes(1, 2) @ unit + damping[:, None, None] * np.eye(guess.shape[1])
+        following = start - np.linalg.solve(matrix, unit.swapaxes(1, 2) @ value.reshape(runs, -1, 1))[:, :, 0] / size
+        if at_rest and i == passes // 2:
             # from there nothing leads back: a side that friction holds does not feel a little velocity
-            following, damping, going = still, np.full(runs, RIDGE), np.ones(runs, bool)
-        indices = np.flatnonzero(going)
-        if not len(indices):
-            continue
-        part = windows.only(indices)
-        along = simulate_windows(experiment, part, shape.unflatten(list(following[indices].T)))
-        value = _leave(experiment, part, along)
-        squares = np.sum(value[:, :fitted_samples] ** 2, axis=(1, 2))
-        better = (squares < cost[indices]) | ~np.isfinite(cost[indices])
-        damping[indices] = np.where(
-            better, np.maximum(0.01 * damping[indices], RIDGE), np.maximum(30.0 * damping[indices], 1e-2)
-        )
-        new, along = indices[better], jax.tree.map(lambda leaf, better=better: leaf[better], along)
-        if len(new):
-            best[new], cost[new], residual[new] = following[new], squares[better], value[better]
-            for stored, leaf in zip(states, jax.tree.leaves(along), strict=True):
-                stored[new] = leaf
-            slope[new] = _differentiate(experiment, (), np.empty(0), part.only(better), along) * fitted[new][:, None, None]
-        unit, size = over_size(slope[indices][:, :fitted_samples])
-        towards = unit.swapaxes(1, 2) @ residual[indices][:, :fitted_samples].reshape(len(indices), -1, 1)
-        matrix = unit.swapaxes(1, 2) @ unit + damping[indices][:, None, None] * np.eye(count)
-        change = np.linalg.solve(matrix, towards)
-        following[indices] = best[indices] - change[:, :, 0] / size
-        going[indices] = ~(np.sum(change * towards, axis=(1, 2)) <= _SETTLED * cost[indices])
-    return Starts(best, residual, slope, shape.unflatten(states))
-
-
-def over_size(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return columns of windows' initial states over their sizes, shape (windows, rows, states), and these, shape
-    (windows, states): infinite for a state without influence, which stays where it is."""
-    flat = slope.reshape(len(slope), -1, slope.shape[-1])
-    size = np.sqrt(np.sum(flat**2, axis=1))
-    size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
-    return flat / size[:, None], size
-
-
-def _basis(slope: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of what initial states can explain, shape (windows, samples times sides, states)."""
-    unit, size = over_size(slope)
+            following, damping = still, np.full(runs, RIDGE)
     # of a column of zeros the decomposition makes any direction
-    return np.where(np.isfinite(size)[:, None], np.linalg.qr(unit)[0], 0.0)
+    basis = np.where(np.isfinite(size)[:, None], np.linalg.qr(unit)[0], 0.0)
+    return _Eliminated(start, value, basis, states)
 
 
 def _choose(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
@@ -288,8 +233,8 @@ def projected_residual(
 
     Of each window's initial state `passes` values are tried, with `at_rest` standstill among them.
     """
-    starts = seek_starts(experiment, windows, passes, at_rest)
-    return _without(_basis(starts.slope), starts.residual), jax.tree.map(lambda leaf: leaf[:, 0], starts.states)
+    found = _eliminate(experiment, windows, passes, at_rest)
+    return _without(found.basis, found.residual), jax.tree.map(lambda leaf: leaf[:, 0], found.states)
 
 
 class _Point(NamedTuple):
@@ -354,12 +299,11 @@ def fit(
         # through zero, so that what is 0 is found without bias
         numbers = {number.path: number._replace(minimum=None).value(x) for number, x in zip(free, theta, strict=True)}
         model = set_leaves(experiment, jax.tree.map(np.asarray, numbers))
-        starts = seek_starts(model, replace(windows, start=start), passes, at_rest)
-        basis = _basis(starts.slope)
-        residual = _without(basis, starts.residual)
+        found = _eliminate(model, replace(windows, start=start), passes, at_rest)
+        residual = _without(found.basis, found.residual)
         squares = float(np.sum(residual**2) + np.sum(precision * (moving * theta) ** 2))
-        best = replace(windows, start=jax.tree.map(lambda leaf: leaf[:, 0], starts.states))
-        return _Point(theta, model, best, basis, starts.states, residual, squares if np.isfinite(squares) else np.inf)
+        best = replace(windows, start=jax.tree.map(lambda leaf: leaf[:, 0], found.states))
+        return _Point(theta, model, best, found.basis, found.states, residual, squares if np.isfinite(squares) else np.inf)
 
     best, converged = None, False
     for turn in range(rounds + 1):

@@ -23,6 +23,7 @@ from scipy.special import chdtri
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import AbstractEffect
+from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import EffectStates, PlantState
 from jaxbl.fused.single_plant import PlantSimulator
 from jaxbl.records.least_squares import rms
@@ -158,25 +159,6 @@ class UnseenLoad:
         """Place of the number that makes the gap, if it is one of the free ones."""
         return next((i for i, number in enumerate(self.free) if is_gap(number)), None)
 
-    def frictions(self) -> list[list[tuple[int, float]]]:
-        """Places of viscous and of dry frictions among the free numbers, motor and load, and the factor that makes each one
-        at the motor."""
-        experiment = self.experiment
-        viscous = {"drive.motor_viscous": "motor", "drive.load_viscous": "load"}
-        dry = {
-            f"effects.{effect.name}.torque": effect.place
-            for effect in experiment.effects
-            if type(effect).dry_friction is not AbstractEffect.dry_friction
-        }
-        return [
-            [
-                (i, float(experiment.drive.ratio(side_of[number.path])) ** -power)
-                for i, number in enumerate(self.free)
-                if number.path in side_of
-            ]
-            for power, side_of in ((2, viscous), (1, dry))
-        ]
-
     def beginnings(self) -> list[np.ndarray]:
         """Theta to begin at, shape (free,): frictions that together are what the log shows of a drive without gap, mostly
         the motor's and mostly the load's.
@@ -190,15 +172,21 @@ class UnseenLoad:
         moving = np.abs(speed) > 0.1 * self._speed
         coefficients = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
         least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
-        total, thetas = np.maximum(coefficients[1:3], least), []
-        for share in _SHARES:
-            theta = np.zeros(len(self.free))
-            for size, places in zip(total, self.frictions(), strict=True):
-                parts = [1.0] if len(places) == 1 else [1.0 - share, share]
-                for (i, factor), part in zip(places, parts, strict=False):
-                    theta[i] = self.free[i].theta(part * size / factor)
-            thetas.append(theta)
-        return thetas
+        total, thetas = np.maximum(coefficients[1:3], least), np.zeros((len(_SHARES), len(self.free)))
+        viscous = {"drive.motor_viscous": "motor", "drive.load_viscous": "load"}
+        dry = {
+            f"effects.{effect.name}.torque": effect.place
+            for effect in self.experiment.effects
+            if type(effect).dry_friction is not AbstractEffect.dry_friction
+        }
+        # friction at the load counts by a power of the gear at the motor
+        for size, power, side_of in zip(total, (2, 1), (viscous, dry), strict=True):
+            places = [i for i, number in enumerate(self.free) if number.path in side_of]
+            for i, parts in zip(places, (1.0 - np.array(_SHARES), _SHARES), strict=False):
+                factor = float(self.experiment.drive.ratio(side_of[self.free[i].path])) ** -power
+                for theta, part in zip(thetas, parts, strict=True):
+                    theta[i] = self.free[i].theta((part if len(places) > 1 else 1.0) * size / factor)
+        return list(thetas)
 
     def coarse(self) -> "UnseenLoad":
         """The same with plant steps just short enough for the drive's fastest oscillation."""
@@ -221,8 +209,7 @@ class UnseenLoad:
 
     def number(self, path: str, theta: np.ndarray) -> float:
         """Value of a number of the model, free or not."""
-        table, _, name = path.partition(".")
-        return self.numbers(theta).get(path, float(getattr(getattr(self.experiment, table), name)))
+        return self.numbers(theta).get(path, float(get_leaf(self.experiment, path)))
 
     def half_gap(self, theta: np.ndarray) -> float:
         """Half gap, rad."""
@@ -373,21 +360,13 @@ class UnseenLoad:
         neighbours = [self._with_steps(2 * self.experiment.run.substeps).resume(point, _FEW)]
         neighbours += [self.resume(point, _FEW, factor * point.smoothness) for factor in _OTHERS]
         best = _likeliest([point, *(self.resume(other, _BACK, point.smoothness) for other in neighbours)])
-        neighbours += self._noisier(best)
+        for seed in range(_DRAWS if self.torque_noise > _QUIET * self.torque else 0):
+            draw = partial(np.random.default_rng(seed).normal, 0.0, self.torque_noise)
+            noisier = [replace(segment, torque=segment.torque + draw(len(segment))) for segment in self.segments]
+            neighbours.append(replace(self, segments=noisier).resume(best, _FEW))
         # not their mean: some end in the valley that they came from, and say nothing
         changes = [other.theta - best.theta for other in neighbours if np.isfinite(other.deviance)]
         return best, self.spread(best).with_error(*changes)
-
-    def _noisier(self, point: Point) -> list[Point]:
-        """Fits with as much white noise again as the recorded torque has, which the drive may not have felt."""
-        points = []
-        for seed in range(_DRAWS if self.torque_noise > _QUIET * self.torque else 0):
-            draw = np.random.default_rng(seed).standard_normal
-            segments = [
-                replace(segment, torque=segment.torque + self.torque_noise * draw(len(segment))) for segment in self.segments
-            ]
-            points.append(replace(self, segments=segments).resume(point, _FEW))
-        return points
 
     def spread(self, point: Point) -> Spread:
         """Covariance of theta, of data and priors together."""
@@ -418,7 +397,6 @@ class Gap(NamedTuple):
         gain: of minus twice the log-likelihood by the gap, correlation of the errors counted.
         crossings: of the gap from flank to flank; of changes of sign of the transmitted torque without a gap.
         at_most: the largest half gap that the log does not rule out, where it does not show one (95 %), rad.
-        starts: half gap that each fit began at, rad, and its deviance above the least.
         travel: of the motor, rad.
         unmet: whether a load that is never met, in a gap wider than the motor's travel, meets the readings as well as none.
     """
@@ -429,7 +407,6 @@ class Gap(NamedTuple):
     gain: float
     crossings: int
     at_most: float
-    starts: list[tuple[float, float]]
     travel: float
     unmet: bool = False
 
@@ -500,9 +477,12 @@ class GapSearch:
     def run(self) -> Gap:
         """Search."""
         announce("trying half gaps")
-        starts = self._starts()
+        # from the encoder's noise to more than the motor's travel, where the load is never met
+        low = max(2.0 * self.model.noise, 1e-4 * self.travel)
+        grid = [*np.geomspace(low, 0.5 * self.travel, _STARTS - 1), 2.0 * self.travel]
+        starts = [self._begin(float(half)) for half in grid]
         announce("fitting the gap")
-        likely = sorted((point for _, point in starts), key=lambda point: point.variance)[:_FINALISTS]
+        likely = sorted(starts, key=lambda point: point.variance)[:_FINALISTS]
         fits = [self.coarse.solve(self.coarse.begin(point.theta, _FOLLOWING[-1]), _MORE) for point in likely]
         best, spread = self.model.settle(self.model.fit([_likeliest(fits).theta]))
         announce("fitting without a gap")
@@ -513,22 +493,14 @@ class GapSearch:
             max(float(width.inflation[self.place]) ** 2, 1.0) for width in (self.model.spread(best), spread)
         )
         gain = max(without.deviance - best.deviance, 0.0) / correlated
-        least = min(point.variance for _, point in starts)
-        deviances = [(half, self.model.count * float(np.log(point.variance / least))) for half, point in starts]
-        gap = Gap(best, without, spread, gain, 0, self.travel, deviances, self.travel)
+        gap = Gap(best, without, spread, gain, 0, self.travel, self.travel)
         if gap.is_needed:
             return gap._replace(crossings=self._turns(best, self.model.half_gap(best.theta)))
-        if self._unmet(without, starts[-1][1], worth):
+        if self._unmet(without, starts[-1], worth):
             return gap._replace(unmet=True)
         # of the torque in the gear, by a twentieth of the input's rms on either side
         wound = 0.05 * self.model.torque / self.model.number("transmission.stiffness", without.theta)
         return gap._replace(at_most=self._at_most(without, worth), crossings=self._turns(without, wound))
-
-    def _starts(self) -> list[tuple[float, Point]]:
-        """Short fits at half gaps from the encoder's noise to more than the motor's travel, where the load is never met."""
-        low = max(2.0 * self.model.noise, 1e-4 * self.travel)
-        grid = [*np.geomspace(low, 0.5 * self.travel, _STARTS - 1), 2.0 * self.travel]
-        return [(float(half), self._begin(half)) for half in grid]
 
     def _begin(self, half: float) -> Point:
         """A short fit of frictions at a half gap, inertias and stiffness as given."""
