@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from jaxbl.chain import Reducer, initial_state, plant_trajectory, replay, scan, unit_noise
 from jaxbl.drive import Encoders, Initial, Rigid, set_leaves
 from jaxbl.drive.effects import ConstantTorque, CoulombFriction
-from jaxbl.estimation.compilation import jit
+from jaxbl.fused.compilation import jit
 from jaxbl.observer import ExplicitSuperTwisting, ImplicitSuperTwisting, Observers
 from jaxbl.sweeps.metrics import ALL_METRICS
 

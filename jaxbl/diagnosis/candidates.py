@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.regression import Path, Samples, SideSamples, effect_path, remembers_input
+from jaxbl.fused.compilation import jit
 
 EffectNumbers = Mapping[str, Numbers]
 """Numbers of effects, by the name of each."""

@@ -29,12 +29,12 @@ from jaxbl.drive.effects import EFFECTS, AbstractEffect, Scales
 from jaxbl.drive.effects.loads import TRIAL_ARC
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.free_parameters import FreeParameter, set_free_parameters
 from jaxbl.estimation.prediction import kalman_gain
 from jaxbl.estimation.regression import Path, effect_states
 from jaxbl.estimation.segments import Segment
 from jaxbl.fused import Arrays, Leaves
+from jaxbl.fused.compilation import jit
 from jaxbl.fused.linear_predictor import LinearPredictor
 from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives

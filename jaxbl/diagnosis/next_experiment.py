@@ -20,10 +20,10 @@ from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import Backlash
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.logs import LogTask, default_paths, on_record
 from jaxbl.estimation.segments import reading_noise, segments_of
 from jaxbl.estimation.unseen_load import GAPS
+from jaxbl.fused.compilation import jit
 from jaxbl.json_types import JsonObject
 from jaxbl.records import Record
 

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
 
 from jaxbl.chain import Experiment, Signals, State, TracedArrays, initial_observer_state, initial_state, replay
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.regression import Kinematics
 from jaxbl.estimation.segments import Segment
+from jaxbl.fused.compilation import jit
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards, parzen_window

@@ -21,10 +21,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import Motion
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.regression import Kinematics, Samples, SideSamples, effect_path
 from jaxbl.estimation.segments import Segment
 from jaxbl.estimation.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
+from jaxbl.fused.compilation import jit
 from jaxbl.records.signal_quality import estimate_white_noise
 
 _REACH = 60.0

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import Experiment, NamedArrays, Signals, State, TracedArrays, replay
+from jaxbl.fused.compilation import jit
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 
-from .compilation import jit
 from .regression import model_torques
 from .search import SearchFit
 from .segments import Segment

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from jaxbl.chain import Experiment, Signals, State, TracedArrays, replay
 from jaxbl.drive.parameters import set_leaves
+from jaxbl.fused.compilation import jit
 
-from .compilation import jit
 from .regression import Kinematics
 
 _ALPHA = np.geomspace(1.1, 6.0, 10)

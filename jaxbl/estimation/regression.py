@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import AbstractEffect
 from jaxbl.drive.plant import EffectStates, Plant, PlantState
+from jaxbl.fused.compilation import jit
 from jaxbl.records.least_squares import BlockRegression, column_rms
 
-from .compilation import jit
 from .descent import descend, linearise
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 from .trajectory import Fit

@@ -16,10 +16,10 @@ import numpy as np
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import DELAY_SAMPLES, AbstractEffect, Motion
 from jaxbl.drive.plant import EffectStates, PlantState
+from jaxbl.fused.compilation import jit
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
-from .compilation import jit
 from .free_parameters import SignalSizes
 from .regression import Kinematics, Path, effect_states, kinematics_from, shortest
 from .smoother import Smoothed, smooth

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import Experiment, NamedArrays, Sample, State, TracedArrays, initial_state, step
-from jaxbl.estimation.compilation import jit
+from jaxbl.fused.compilation import jit
 
 BLOCKS = (256, 2048, 16_384)
 """Samples of a call: few for rows as they come, at 1 or 10 kHz, and many for a recording."""

@@ -27,7 +27,7 @@ import numpy as np
 
 from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.drive.transmission import AbstractTransmission
-from jaxbl.estimation.compilation import jit
+from jaxbl.fused.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.quantity import Quantity
 from jaxbl.records.linear_filters import savitzky_golay_slopes

@@ -10,7 +10,7 @@ from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis.neutral_effects import bucket, candidates, complete, has_state
 from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import as_arrays, parameters
-from jaxbl.estimation.compilation import jit
+from jaxbl.fused.compilation import jit
 
 NEVER_ADDED = {"actuator.back_emf", "motor.tabulated", "load.tabulated"} | {
     name for name in EFFECTS if name.startswith("encoder.")

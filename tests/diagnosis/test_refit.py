@@ -11,11 +11,11 @@ from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
 from jaxbl.diagnosis.linearised_model import Linear
 from jaxbl.diagnosis.refit import ModelFits, _Fit, leave_quarters_out
 from jaxbl.drive.plant import PlantState
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.regression import settle_states
 from jaxbl.estimation.segments import segments_of
+from jaxbl.fused.compilation import jit
 
 NAME = "motor.coulomb_friction"
 

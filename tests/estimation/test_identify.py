@@ -14,11 +14,11 @@ from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
 from jaxbl.errors import InputError
 from jaxbl.estimation import observer_gains
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.identify import identify
 from jaxbl.estimation.logs import default_paths
 from jaxbl.estimation.search import ParameterSearch
+from jaxbl.fused.compilation import jit
 from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.report.identify import describe as describe_identification
 from jaxbl.report.results import write_report

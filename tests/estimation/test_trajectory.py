@@ -16,11 +16,11 @@ from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
-from jaxbl.estimation.compilation import jit
 from jaxbl.estimation.free_parameters import SignalSizes, make_free_parameters, set_free_parameters
 from jaxbl.estimation.intervals import refusals, spread
 from jaxbl.estimation.smoother import smooth
 from jaxbl.estimation.trajectory import Fit, cut, fit
+from jaxbl.fused.compilation import jit
 
 TRUE = {
     "drive.motor_inertia": 0.05,

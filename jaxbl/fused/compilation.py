@@ -21,7 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from jaxbl.fused import program_cache
+from . import program_cache
 
 Result = TypeVar("Result")
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.estimation import compilation
+from jaxbl.fused import compilation
 
 
 @pytest.fixture(params=[compilation._FAST, {"xla_cpu_no_such_option": True}], ids=["known", "unknown"])
