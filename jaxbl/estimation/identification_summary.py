@@ -131,7 +131,7 @@ def by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
         "windows": len(search_fit.firsts),
         "converged": search_fit.fit.converged,
         "starts": len(search_fit.starts),
-        "starts_agreeing": sum(start["agrees"] for start in search_fit.starts),
+        "starts_agreeing": sum(search_fit.starts),
         "variance_over_noise": search_fit.spread.variance,
         "inflation": by_path(search_fit.spread.inflation),
         "smoothness": search_fit.smoothness,

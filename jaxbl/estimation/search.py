@@ -10,7 +10,6 @@ import numpy as np
 from jaxbl.chain import Experiment
 from jaxbl.config.logs import IdentifyTable
 from jaxbl.errors import InputError
-from jaxbl.json_types import JsonObject
 
 from .free_parameters import FreeParameter, set_free_parameters
 from .intervals import Refusal, Spread, refusals, spread
@@ -80,13 +79,13 @@ class SearchFit(Fitted):
         refused: directions that the record does not show.
         held: numbers that were left at their nominal values therefore.
         condition: of the information about all numbers asked for.
-        starts: cost and theta of each start, and whether it agrees with the best.
+        starts: whether each start agrees with the best.
     """
 
     refused: list[Refusal]
     held: list[str]
     condition: float
-    starts: list[JsonObject]
+    starts: list[bool]
 
 
 def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarray:
@@ -158,7 +157,7 @@ class ParameterSearch:
     def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
         return windows_of(self.segments, self.experiment, samples, self.at_rest)
 
-    def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[JsonObject]]:
+    def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[bool]]:
         """Best of several starts, on short windows from all over the record.
 
         Starts agree with it whose costs are at most 1 % larger; of the cost of noise alone, if that is more.
@@ -174,17 +173,12 @@ class ParameterSearch:
         tries = [fit(self.experiment, free, windows, theta, _FEW_STEPS, rounds=1) for theta in thetas]
         cost = np.array([end.cost for end in tries])
         cost = np.where(np.isfinite(cost), cost, np.inf)
-        thetas_found = np.array([end.theta for end in tries])
         if not np.isfinite(cost).any():
             raise InputError(f"{self.name}: the model diverges from every start; its nominal numbers should be nearer")
         best = int(np.argmin(cost))
         # fits end where they change residuals by little beside the noise: without noise, costs may be any times one another
         same = cost[best] + 0.01 * max(cost[best], tries[best].residual.size / 2)
-        starts = [
-            {"cost": float(c), "agrees": bool(c <= same), "theta": t.tolist()}
-            for c, t in zip(cost, thetas_found, strict=True)
-        ]
-        return _nearest_turn(free, thetas_found[best]), starts
+        return _nearest_turn(free, tries[best].theta), (cost <= same).tolist()
 
     def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray, fitted: np.ndarray) -> Fitted:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""

@@ -177,25 +177,6 @@ def _first(position: Any, smoothness: Any) -> Leaves:
     ]
 
 
-def _likelihood(scaled: Any, logs: Any) -> tuple[Any, Any]:
-    """Log-likelihood of several smoothnesses at their best noise, and that noise; positions in any unit, as the filter's
-    gains do not depend on it."""
-    values, start = [np.exp(logs)], [number + 0.0 * logs for number in _start(scaled)]
-    # the first samples find the state
-    e, s = (column[3:] for column in _along(_innovation, values, start, [scaled]))
-    variance = np.sum(e**2 / s, axis=0) / len(e)
-    return -0.5 * (len(e) * np.log(variance) + np.sum(np.log(s), axis=0)), np.sqrt(variance)
-
-
-def _zoom(scaled: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
-    """Ends of a ninth of a range about the logarithm of the smoothness of largest likelihood, and the noise there."""
-    points = low + (high - low) * np.linspace(0.0, 1.0, _GRID)
-    likelihood, noise = _likelihood(scaled, points)
-    best = np.argmax(likelihood)
-    step = (high - low) / (_GRID - 1)
-    return points[best] - step, points[best] + step, noise[best]
-
-
 def _unit(position: Any) -> Any:
     """A guess of the noise."""
     # third differences of white noise have variance 20 sigma^2; smooth motion adds little to their median
@@ -226,14 +207,22 @@ def _run_smoother(position: Any, smoothness: Any, noise: Any, period: Any) -> Sm
 
 
 def _fit(position: np.ndarray) -> tuple[Any, Any]:
-    """Smoothness q h^5 / sigma^2 and sigma of largest likelihood."""
+    """Smoothness q h^5 / sigma^2 and sigma of largest likelihood, each at its best noise: ninth by ninth of the range."""
     unit = _unit(position)
+    # positions may have any unit, as the filter's gains do not depend on it
     scaled = (position - position[0]) / unit
     low, high = np.log(_SMOOTHNESS)
-    noise = np.float64(1.0)
+    variance, best = np.ones(1), 0
     for _ in range(_ZOOMS):
-        low, high, noise = _zoom(scaled, low, high)
-    return np.exp(0.5 * (low + high)), noise * unit
+        points = low + (high - low) * np.linspace(0.0, 1.0, _GRID)
+        start = [number + 0.0 * points for number in _start(scaled)]
+        # the first samples find the state
+        e, s = (column[3:] for column in _along(_innovation, [np.exp(points)], start, [scaled]))
+        variance = np.sum(e**2 / s, axis=0) / len(e)
+        best = np.argmax(-0.5 * (len(e) * np.log(variance) + np.sum(np.log(s), axis=0)))
+        step = (high - low) / (_GRID - 1)
+        low, high = points[best] - step, points[best] + step
+    return np.exp(0.5 * (low + high)), np.sqrt(variance[best]) * unit
 
 
 def smooth(position: Signal, period: float, *, noise_and_jerk: tuple[Any, Any] | None = None) -> Smoothed:

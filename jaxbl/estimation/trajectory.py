@@ -162,13 +162,22 @@ def _differentiate(
 
 
 class _Eliminated(NamedTuple):
-    """Initial states of windows, shape (windows, states), the residuals from there, an orthonormal basis of what those
-    states can explain, shape (windows, samples times sides, states), and the states along the windows."""
+    """Windows from the initial states that suit them.
 
-    start: np.ndarray
-    residual: np.ndarray
-    basis: np.ndarray
+    Attributes:
+        states: along the windows, leaves of shape (windows, samples).
+        basis: orthonormal, of what their initial states can explain; shape (windows, samples times sides, states).
+        residual: without that, shape (windows, samples, sides).
+    """
+
     states: PlantState
+    basis: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def start(self) -> PlantState:
+        """Initial states, leaves of shape (windows,)."""
+        return jax.tree.map(lambda leaf: leaf[:, 0], self.states)
 
 
 def _eliminate(experiment: Experiment, windows: Windows, passes: int, at_rest: bool) -> _Eliminated:
@@ -211,7 +220,7 @@ def _eliminate(experiment: Experiment, windows: Windows, passes: int, at_rest: b
             following, damping = still, np.full(runs, RIDGE)
     # of a column of zeros the decomposition makes any direction
     basis = np.where(np.isfinite(size)[:, None], np.linalg.qr(unit)[0], 0.0)
-    return _Eliminated(start, value, basis, states)
+    return _Eliminated(states, basis, _without(basis, value))
 
 
 def _choose(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
@@ -234,7 +243,7 @@ def projected_residual(
     Of each window's initial state `passes` values are tried, with `at_rest` standstill among them.
     """
     found = _eliminate(experiment, windows, passes, at_rest)
-    return _without(found.basis, found.residual), jax.tree.map(lambda leaf: leaf[:, 0], found.states)
+    return found.residual, found.start
 
 
 class _Point(NamedTuple):
@@ -243,30 +252,19 @@ class _Point(NamedTuple):
     Attributes:
         theta: shape (parameters,).
         model: with these numbers.
-        windows: with the initial states that suit them.
-        basis: what those states can explain.
-        states: along the windows.
-        residual: without what they can explain, shape (windows, samples, sides).
+        found: the windows there.
         deviance: sum of squares, that of the prior included.
     """
 
     theta: np.ndarray
     model: Experiment
-    windows: Windows
-    basis: np.ndarray
-    states: PlantState
-    residual: np.ndarray
+    found: _Eliminated
     deviance: float
 
     @property
     def squares(self) -> np.ndarray:
         """Sum of squared residuals of each window."""
-        return np.sum(self.residual**2, axis=(1, 2))
-
-    def slope(self, free: Sequence[FreeParameter]) -> np.ndarray:
-        """Kaufman's derivative of the residuals by theta, shape (windows, samples, sides, parameters)."""
-        slope = _differentiate(self.model, free, self.theta, self.windows, self.states)
-        return _without(self.basis, slope[..., : len(free)])
+        return np.sum(self.found.residual**2, axis=(1, 2))
 
 
 @np.errstate(all="ignore")
@@ -300,10 +298,13 @@ def fit(
         numbers = {number.path: number._replace(minimum=None).value(x) for number, x in zip(free, theta, strict=True)}
         model = set_leaves(experiment, jax.tree.map(np.asarray, numbers))
         found = _eliminate(model, replace(windows, start=start), passes, at_rest)
-        residual = _without(found.basis, found.residual)
-        squares = float(np.sum(residual**2) + np.sum(precision * (moving * theta) ** 2))
-        best = replace(windows, start=jax.tree.map(lambda leaf: leaf[:, 0], found.states))
-        return _Point(theta, model, best, found.basis, found.states, residual, squares if np.isfinite(squares) else np.inf)
+        squares = float(np.sum(found.residual**2) + np.sum(precision * (moving * theta) ** 2))
+        return _Point(theta, model, found, squares if np.isfinite(squares) else np.inf)
+
+    def slope(point: _Point) -> np.ndarray:
+        """Kaufman's derivative of the residuals by theta, shape (windows, samples, sides, parameters)."""
+        whole = _differentiate(point.model, free, point.theta, windows, point.found.states)
+        return _without(point.found.basis, whole[..., : len(free)])
 
     best, converged = None, False
     for turn in range(rounds + 1):
@@ -311,22 +312,22 @@ def fit(
         anew = evaluate(np.asarray(theta, float) if best is None else best.theta, windows.start, _OUTER, True)
         if best is not None:
             gains = best.squares - anew.squares
-            start = jax.tree.map(partial(_choose, gains > 0.0), anew.windows.start, best.windows.start)
+            start = jax.tree.map(partial(_choose, gains > 0.0), anew.found.start, best.found.start)
             best = evaluate(best.theta, start)
             if turn == rounds or not np.any(gains > _GAINED * np.sum(best.squares) / count):
                 break
         best, converged = descend(
             best or anew,
-            lambda point: linearise(point.residual, moving * point.slope(free), moving * point.theta, precision),
-            lambda point, change: evaluate(point.theta + change, point.windows.start),
+            lambda point: linearise(point.found.residual, moving * slope(point), moving * point.theta, precision),
+            lambda point, change: evaluate(point.theta + change, point.found.start),
             most_steps,
             lambda point: _ENOUGH * point.deviance / count,
         )
         if rounds == 1:
             break
     assert best is not None
-    residual = best.residual
-    return Fit(best.theta, best.windows.start, residual, best.slope(free), 0.5 * np.sum(residual**2), converged)
+    residual = best.found.residual
+    return Fit(best.theta, best.found.start, residual, slope(best), 0.5 * np.sum(residual**2), converged)
 
 
 def cut(
