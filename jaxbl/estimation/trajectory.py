@@ -131,9 +131,9 @@ def _differentiate(
 ) -> np.ndarray:
     """Derivative of the residuals by theta and the initial states, shape (windows, samples, sides, parameters + states)."""
     runs, samples = windows.torque.shape
-    each = max(_AT_ONCE // samples, 1)
-    if runs > each:
-        parts = [slice(first, first + each) for first in range(0, runs, each)]
+    most = max(_AT_ONCE // samples, 1)
+    if runs > most:
+        parts = [slice(first, first + most) for first in range(0, runs, most)]
         pieces = [(windows.only(part), jax.tree.map(lambda leaf, part=part: leaf[part], states)) for part in parts]
         return np.concatenate([_differentiate(experiment, free, theta, *piece) for piece in pieces])
     shape, count = jax.tree.structure(states), len(jax.tree.leaves(states))
@@ -242,8 +242,8 @@ def projected_residual(
 
     Of each window's initial state `passes` values are tried, with `at_rest` standstill among them.
     """
-    found = _eliminate(experiment, windows, passes, at_rest)
-    return found.residual, found.start
+    eliminated = _eliminate(experiment, windows, passes, at_rest)
+    return eliminated.residual, eliminated.start
 
 
 class _Point(NamedTuple):
@@ -252,19 +252,19 @@ class _Point(NamedTuple):
     Attributes:
         theta: shape (parameters,).
         model: with these numbers.
-        found: the windows there.
+        eliminated: the windows there.
         deviance: sum of squares, that of the prior included.
     """
 
     theta: np.ndarray
     model: Experiment
-    found: _Eliminated
+    eliminated: _Eliminated
     deviance: float
 
     @property
     def squares(self) -> np.ndarray:
         """Sum of squared residuals of each window."""
-        return np.sum(self.found.residual**2, axis=(1, 2))
+        return np.sum(self.eliminated.residual**2, axis=(1, 2))
 
 
 @np.errstate(all="ignore")
@@ -297,14 +297,14 @@ def fit(
         # through zero, so that what is 0 is found without bias
         numbers = {number.path: number._replace(minimum=None).value(x) for number, x in zip(free, theta, strict=True)}
         model = set_leaves(experiment, jax.tree.map(np.asarray, numbers))
-        found = _eliminate(model, replace(windows, start=start), passes, at_rest)
-        squares = float(np.sum(found.residual**2) + np.sum(precision * (moving * theta) ** 2))
-        return _Point(theta, model, found, squares if np.isfinite(squares) else np.inf)
+        eliminated = _eliminate(model, replace(windows, start=start), passes, at_rest)
+        squares = float(np.sum(eliminated.residual**2) + np.sum(precision * (moving * theta) ** 2))
+        return _Point(theta, model, eliminated, squares if np.isfinite(squares) else np.inf)
 
     def slope(point: _Point) -> np.ndarray:
         """Kaufman's derivative of the residuals by theta, shape (windows, samples, sides, parameters)."""
-        whole = _differentiate(point.model, free, point.theta, windows, point.found.states)
-        return _without(point.found.basis, whole[..., : len(free)])
+        slopes = _differentiate(point.model, free, point.theta, windows, point.eliminated.states)
+        return _without(point.eliminated.basis, slopes[..., : len(free)])
 
     best, converged = None, False
     for turn in range(rounds + 1):
@@ -312,22 +312,22 @@ def fit(
         anew = evaluate(np.asarray(theta, float) if best is None else best.theta, windows.start, _OUTER, True)
         if best is not None:
             gains = best.squares - anew.squares
-            start = jax.tree.map(partial(_choose, gains > 0.0), anew.found.start, best.found.start)
+            start = jax.tree.map(partial(_choose, gains > 0.0), anew.eliminated.start, best.eliminated.start)
             best = evaluate(best.theta, start)
             if turn == rounds or not np.any(gains > _GAINED * np.sum(best.squares) / count):
                 break
         best, converged = descend(
             best or anew,
-            lambda point: linearise(point.found.residual, moving * slope(point), moving * point.theta, precision),
-            lambda point, change: evaluate(point.theta + change, point.found.start),
+            lambda point: linearise(point.eliminated.residual, moving * slope(point), moving * point.theta, precision),
+            lambda point, change: evaluate(point.theta + change, point.eliminated.start),
             most_steps,
             lambda point: _ENOUGH * point.deviance / count,
         )
         if rounds == 1:
             break
     assert best is not None
-    residual = best.found.residual
-    return Fit(best.theta, best.found.start, residual, slope(best), 0.5 * np.sum(residual**2), converged)
+    residual = best.eliminated.residual
+    return Fit(best.theta, best.eliminated.start, residual, slope(best), 0.5 * np.sum(residual**2), converged)
 
 
 def cut(

@@ -375,8 +375,8 @@ class UnseenLoad:
         for _ in range(2):
             slope = self.slopes(point, size)
             size = (np.sum(slope**2, axis=0) / point.variance + precision) ** -0.5
-        spread_of_all = spread_of(point.errors[None, :, None], slope[None, :, None], 0, precision=precision)
-        return spread_of_all.only(np.arange(len(self.free)))
+        joint = spread_of(point.errors[None, :, None], slope[None, :, None], 0, precision=precision)
+        return joint.only(np.arange(len(self.free)))
 
 
 _QUIET = 1e-4
