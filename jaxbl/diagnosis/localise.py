@@ -17,12 +17,8 @@ import numpy as np
 from jaxbl.chain import Experiment
 from jaxbl.estimation.regression import Kinematics, balance
 from jaxbl.estimation.segments import Segment
-<<<<<<< HEAD
-from jaxbl.records.least_squares import as_normal, rms
-=======
 from jaxbl.fused.compilation import jit
-from jaxbl.records.least_squares import rms
->>>>>>> 3d6ed6d2 (Compilation of programs that run a few times lies beside the cache they are kept in: monitoring and diagnosis use it as estimation does)
+from jaxbl.records.least_squares import as_normal, rms
 
 from .coordinates import CoordinateValues
 from .residuals import Residual, SideResiduals, narrow, noise_spectrum

@@ -35,6 +35,9 @@ RIDGE = 1e-10
 """Least damping of a search for initial states, over the columns' squares: above rounding, below what it changes."""
 INFLUENCE = 1e-20
 """Of a state, over that of the one with the most: what is below is none (an effect that does nothing)."""
+_SETTLED = 1e-9
+"""Share of its sum of squares that a further step of a window's search may promise where it ends: rounding is 1e-15, what
+decides is 1e-2."""
 _ENOUGH = 2e-3
 """A fit has ended where a step takes less than this off the sum of squares, in units of the residuals' variance."""
 _GAINED = 1.0
@@ -161,6 +164,95 @@ def _differentiate(
     return -slopes.transpose(1, 0, 2, 3) / noise[:, None]
 
 
+class Starts(NamedTuple):
+    """Windows of a model from the initial states that suit them best.
+
+    Attributes:
+        residual: from there over the noise, shape (windows, samples, sides).
+        slope: its derivative by the initial states that are fitted, 0 by others; shape (windows, samples, sides, states).
+        states: along the windows, leaves of shape (windows, samples).
+    """
+
+    residual: np.ndarray
+    slope: np.ndarray
+    states: PlantState
+
+
+def seek_starts(
+    experiment: Experiment,
+    windows: Windows,
+    passes: int,
+    at_rest: bool,
+    fitted_samples: int | None = None,
+    known_before: np.ndarray | bool = False,
+) -> Starts:
+    """Seek the initial states of windows by damped Gauss-Newton.
+
+    The best of all states tried counts: at a hard gap, or where dry friction holds, a full step often makes things worse.
+
+    Args:
+        experiment: with as many plant steps in a sample as it needs.
+        windows: with a guess.
+        passes: initial states that are tried for a window at most.
+        at_rest: whether standstill is one of them.
+        fitted_samples: of a window that they are fitted to; all if left out.
+        known_before: whether what was before a window is known, so that an effect's state follows; shape (windows,).
+    """
+    leaves, shape = jax.tree.flatten(windows.start)
+    places: Any = shape.unflatten(range(len(leaves)))
+    (runs, samples), count = windows.torque.shape, len(leaves)
+    best = np.stack([np.broadcast_to(leaf, runs) for leaf in leaves], axis=1).astype(float)
+    moving = [places.velocity[side] for side in experiment.sides]
+    still, fitted = best.copy(), np.ones_like(best)
+    still[:, moving] = 0.0
+    fitted[np.ix_(np.flatnonzero(windows.at_rest), moving)] = 0.0
+    for effect, state in zip(experiment.effects, places.effects, strict=True):
+        # others follow from numbers that are still to be fitted
+        is_known = effect.state_from_input | (known_before & effect.state_from_measurement)
+        fitted[np.ix_(np.flatnonzero(np.broadcast_to(is_known, runs)), jax.tree.leaves(state))] = 0.0
+    residual = np.zeros((runs, samples, len(moving)))
+    slope, states = np.zeros((*residual.shape, count)), [np.zeros((runs, samples)) for _ in leaves]
+    following, going = best.copy(), np.ones(runs, bool)
+    damping, cost = np.full(runs, RIDGE), np.full(runs, np.inf)
+    for i in range(passes):
+        if at_rest and i == passes // 2 + 1:
+            # from there nothing leads back: a side that friction holds does not feel a little velocity
+            following, damping, going = still, np.full(runs, RIDGE), np.ones(runs, bool)
+        indices = np.flatnonzero(going)
+        if not len(indices):
+            continue
+        part = windows.only(indices)
+        along = simulate_windows(experiment, part, shape.unflatten(list(following[indices].T)))
+        value = _leave(experiment, part, along)
+        squares = np.sum(value[:, :fitted_samples] ** 2, axis=(1, 2))
+        better = (squares < cost[indices]) | ~np.isfinite(cost[indices])
+        damping[indices] = np.where(
+            better, np.maximum(0.01 * damping[indices], RIDGE), np.maximum(30.0 * damping[indices], 1e-2)
+        )
+        new, along = indices[better], jax.tree.map(lambda leaf, better=better: leaf[better], along)
+        if len(new):
+            best[new], cost[new], residual[new] = following[new], squares[better], value[better]
+            for stored, leaf in zip(states, jax.tree.leaves(along), strict=True):
+                stored[new] = leaf
+            slope[new] = _differentiate(experiment, (), np.empty(0), part.only(better), along) * fitted[new][:, None, None]
+        unit, size = over_size(slope[indices][:, :fitted_samples])
+        towards = unit.swapaxes(1, 2) @ residual[indices][:, :fitted_samples].reshape(len(indices), -1, 1)
+        matrix = unit.swapaxes(1, 2) @ unit + damping[indices][:, None, None] * np.eye(count)
+        change = np.linalg.solve(matrix, towards)
+        following[indices] = best[indices] - change[:, :, 0] / size
+        going[indices] = ~(np.sum(change * towards, axis=(1, 2)) <= _SETTLED * cost[indices])
+    return Starts(residual, slope, shape.unflatten(states))
+
+
+def over_size(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return columns of windows' initial states over their sizes, shape (windows, rows, states), and these, shape
+    (windows, states): infinite for a state without influence, which stays where it is."""
+    flat = slope.reshape(len(slope), -1, slope.shape[-1])
+    size = np.sqrt(np.sum(flat**2, axis=1))
+    size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
+    return flat / size[:, None], size
+
+
 class _Eliminated(NamedTuple):
     """Windows from the initial states that suit them.
 
@@ -181,46 +273,12 @@ class _Eliminated(NamedTuple):
 
 
 def _eliminate(experiment: Experiment, windows: Windows, passes: int, at_rest: bool) -> _Eliminated:
-    """Initial states of windows by damped Gauss-Newton, and a basis of what they can explain.
-
-    The best of all states tried counts: at a hard gap, or where dry friction holds, a full step often makes things worse.
-    With `at_rest`, standstill is tried as well.
-    """
-    leaves, shape = jax.tree.flatten(windows.start)
-    places: Any = shape.unflatten(range(len(leaves)))
-    guess, moving = np.stack(leaves, axis=1).astype(float), list(places.velocity.values())
-    still, fitted = guess.copy(), np.ones_like(guess)
-    still[:, moving] = 0.0
-    fitted[np.ix_(np.flatnonzero(windows.at_rest), moving)] = 0.0
-    # others follow from numbers that are still to be found
-    for effect, state in zip(experiment.effects, places.effects, strict=True):
-        if effect.state_from_input:
-            fitted[:, jax.tree.leaves(state)] = 0.0
-    runs, following, best = len(guess), guess, None
-    damping, cost = np.full(runs, RIDGE), np.full(runs, np.inf)
-    for i in range(passes):
-        states = simulate_windows(experiment, windows, shape.unflatten(list(following.T)))
-        value = _leave(experiment, windows, states)
-        slope = _differentiate(experiment, (), np.empty(0), windows, states) * fitted[:, None, None]
-        squares = np.sum(value**2, axis=(1, 2))
-        better = (squares < cost) | ~np.isfinite(cost)
-        damping = np.where(better, np.maximum(0.01 * damping, RIDGE), np.maximum(30.0 * damping, 1e-2))
-        new = following, value, slope, squares, states
-        best = new if best is None else jax.tree.map(partial(_choose, better), new, best)
-        start, value, slope, cost, states = best
-        flat = slope.reshape(runs, -1, guess.shape[1])
-        size = np.sqrt(np.sum(flat**2, axis=1))
-        # a state without influence stays where it is
-        size = np.where(size > INFLUENCE * np.max(size, axis=1, keepdims=True), size, np.inf)
-        unit = flat / size[:, None]
-        matrix = unit.swapaxes(1, 2) @ unit + damping[:, None, None] * np.eye(guess.shape[1])
-        following = start - np.linalg.solve(matrix, unit.swapaxes(1, 2) @ value.reshape(runs, -1, 1))[:, :, 0] / size
-        if at_rest and i == passes // 2:
-            # from there nothing leads back: a side that friction holds does not feel a little velocity
-            following, damping = still, np.full(runs, RIDGE)
+    """Seek the initial states of windows, and a basis of what they can explain."""
+    starts = seek_starts(experiment, windows, passes, at_rest)
+    unit, size = over_size(starts.slope)
     # of a column of zeros the decomposition makes any direction
     basis = np.where(np.isfinite(size)[:, None], np.linalg.qr(unit)[0], 0.0)
-    return _Eliminated(states, basis, _without(basis, value))
+    return _Eliminated(starts.states, basis, _without(basis, starts.residual))
 
 
 def _choose(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
