@@ -108,16 +108,13 @@ class Groups:
     Attributes:
         index: values of the columns, a level each.
         varied: columns of the rows that have more than one value.
-        rows: number of all rows.
     """
 
     def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], further: Sequence[str] = ()):
         self._rows, self._keys = rows, list(keys)
         distinct, first = Distinct(), {}
         self.varied: set[str] = set()
-        self.rows = 0
         for frame in _read_columns(rows, [*self._keys, *further]):
-            self.rows += len(frame)
             if self._keys:
                 distinct.add(frame[self._keys])
             for name in further if len(frame) else ():

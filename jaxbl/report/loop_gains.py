@@ -14,7 +14,7 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import find_metric
 
 from .maps import axis_label
-from .panels import BLUE, VERMILION, Axis, Figure, Panel, arrange, cloud, mark, with_unit
+from .panels import BLUE, Axis, Figure, Panel, arrange, cloud, mark, with_unit
 from .tune import for_title, write_gains
 
 
@@ -25,7 +25,7 @@ def draw(tuning: LoopTuning) -> list[Figure]:
     for path, gain in summary["gains"].items():
         parts = [
             cloud(candidates[path], candidates["error"], "tried", BLUE, marker="o", size=3.0),
-            mark(gain, summary["error_in_search"], "tuned", "*", 12.0, VERMILION),
+            mark(gain, summary["error_in_search"], "tuned"),
         ]
         axes = Axis(axis_label(tuning.config, path), path, log=True), Axis(with_unit(metric.label, metric.unit), log=True)
         panels.append(Panel(*axes, parts))

@@ -13,7 +13,7 @@ from jaxbl.config import Config
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
-from jaxbl.result import KeyFigure, Result, ResultTable
+from jaxbl.result import Result, ResultTable
 
 from .maps import axis_label
 from .panels import (
@@ -88,22 +88,15 @@ def describe(choice: ObserverChoice) -> Result:
     """Say which kind of observer is best, and by how much."""
     config, summary = choice.config, choice.summary
     points, kind = summary["points"], summary.get("for_both_sides")
-    figures = []
-    for side in points[0]["sides"]:
-        best = Counter(point["sides"][side]["best"] for point in points)
-        del best[None]
-        for name, count in best.most_common(1):
-            share = f"best at {count} of {len(points)} points" if len(points) > 1 else "best"
-            figures.append(KeyFigure(name, f"{side}: {share} ({summary['objective']} error, {_where(summary)})"))
     verdict, headline = "good", f"Take {kind}: gains.toml has its gains."
-    if not figures:
+    if not any(result["best"] for point in points for result in point["sides"].values()):
         verdict, headline = "failed", "All kinds of observers diverge, or are too slow."
     elif kind is None:
         headline = "Which observer is best depends on the point; the tables show where."
         if len(points) == 1:
             verdict, headline = "doubtful", "No kind converges on both sides."
     title, remarks = config.title or "Observers", choice_headline(summary)
-    return Result(title, verdict, headline, figures, remarks, summary["remarks"], _tables(config, summary))
+    return Result(title, verdict, headline, (), remarks, summary["remarks"], _tables(config, summary))
 
 
 def observer_toml(summary: JsonObject) -> str | None:

@@ -219,11 +219,9 @@ def intervals(
     return [Line(*bar, colour=colour, width=1.8, opacity=0.6), Line(*points, name, **{"width": 0.0, "marker": "o"} | how)]
 
 
-def mark(
-    x: float, y: float, name: str, marker: str = "*", size: float = 14.0, fill: str = "#FFFFFF", held: bool = True
-) -> Line:
-    """A point with a name; if `held`, on the edge of the axes where it lies outside."""
-    return Line([x], [y], name, width=0.0, marker=marker, size=size, fill="#FFFFFF", held=held)
+def mark(x: float, y: float, name: str, marker: str = "*", size: float = 14.0) -> Line:
+    """A point with a name; on the edge of the axes where it lies outside."""
+    return Line([x], [y], name, width=0.0, marker=marker, size=size, fill="#FFFFFF", held=True)
 
 
 def cloud(x: Any, y: Any, name: str = "", colour: str = FAINT, **how: Any) -> Line:

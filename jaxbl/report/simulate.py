@@ -90,8 +90,7 @@ def draw(trial: Trial) -> list[Figure]:
     figures = [_compare("torque", trace, name, "N m", ("true", trace["torque"]), estimates, caption)]
     for side in trial.config.sides:
         true, estimate = (trace[f"{side}.velocity{end}"] for end in ("", "_estimate"))
-        paper = f" (analogue of Figs. {_FIGURES[side]})" if side in _FIGURES else ""
-        caption = f"{side.capitalize()} velocity, true and observed, and the error{paper}."
+        caption = f"{side.capitalize()} velocity, true and observed, and the error."
         observed = {"observer": (estimate, VERMILION)}
         figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", ("true", true), observed, caption))
     if controller is not None:
@@ -103,9 +102,6 @@ def draw(trial: Trial) -> list[Figure]:
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     figures += itertools.chain(*(error_plane(trace, side, gains) for side, gains in judged.items()))
     return [*figures, _hysteresis(trace)] if is_geared else figures
-
-
-_FIGURES = {"motor": "8-9", "load": "12-13"}
 
 
 def _compare(

@@ -50,7 +50,7 @@ def test_groups_are_those_of_pandas():
     expected = frame.groupby(["a", "b"], sort=True)["v"]
     column = Column(["v"], lambda part: part["v"])
     means = groups.means({"v": column})
-    assert (groups.rows, groups.varied) == (500, {"a"})
+    assert groups.varied == {"a"}
     pd.testing.assert_series_equal(means["v"], expected.mean())
     pd.testing.assert_series_equal(means["rows"], expected.size(), check_names=False)
     pd.testing.assert_series_equal(groups.medians(column), expected.median(), check_names=False)
