@@ -42,12 +42,6 @@ def error_label(summary: JsonObject) -> str:
     return with_unit(metric.label, metric.unit)
 
 
-def _compared_gains(summary: JsonObject, side: str) -> list[tuple[str, str, JsonObject]]:
-    """Name, marker and figures on the study's own excitation of the gains that the tuned ones are compared with."""
-    rows = [row for row in summary["named"] if row["side"] == side and row["name"] != "tuned"]
-    return [(literal(row["name"]), marker, row) for row, marker in zip(rows, cycle(MARKERS), strict=False)]
-
-
 def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
@@ -64,7 +58,10 @@ def _map(tuning: Tuning, side: str) -> Figure:
     alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
     parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
-    parts += [mark(row["alpha"], row["lambda"], name, marker, 8.0) for name, marker, row in _compared_gains(summary, side)]
+    # on the study's own excitation
+    compared = [row for row in summary["named"] if row["side"] == side and row["name"] != "tuned"]
+    for row, marker in zip(compared, cycle(MARKERS), strict=False):
+        parts.append(mark(row["alpha"], row["lambda"], literal(row["name"]), marker, 8.0))
     parts.append(mark(gains["alpha"], gains["lambda"], "tuned"))
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     if flat := flat_remark(values):

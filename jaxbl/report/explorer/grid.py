@@ -46,10 +46,7 @@ def _length(dim: AxisColumns) -> int:
 
 def _places(dim: AxisColumns, frame: pd.DataFrame) -> Array:
     """The places of a frame's rows along a dimension."""
-    if len(dim) == 1:
-        ((path, values),) = dim.items()
-        return pd.Index(values).get_indexer(pd.Index(frame[path]))
-    values, rows = (pd.MultiIndex.from_arrays([table[path] for path in dim]) for table in (dim, frame))
+    values, rows = (table.set_index([*dim]).index for table in (pd.DataFrame(dim), frame))
     return values.get_indexer(rows)
 
 
