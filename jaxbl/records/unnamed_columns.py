@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import residual_mean_square
 from .libraries import ColumnName
-from .rigid_body import smooth_sign
-from .signal_quality import find_bandwidth, low_pass, low_pass_motion
+from .rigid_body import fit_rigid_drive
 
 _Signals = Mapping[ColumnName, np.ndarray]
 _SAME, _GEARED = 0.9, 0.99
@@ -19,9 +17,9 @@ _SAME_SIZE = 0.1
 _LATE = 1e-6
 """Slope of the correlation of two columns at no shift, a row, from which on one is later: rounding aside."""
 _SPEED = 0.95
-"""Correlation with the velocity from which on a column is a speed."""
-_EXPLAINED = 0.7
-"""Share of a torque's mean square that acceleration, velocity and direction explain in a plain drive."""
+"""Share of a column that goes with the velocity, from which on it is a speed."""
+_UNEXPLAINED = 0.55
+"""Share of a torque that acceleration, velocity and direction do not explain at most, in a plain drive."""
 _ROUND = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0)
 """Digits of usual periods; degrees beside rad/s, or rad beside rpm, give others."""
 
@@ -89,18 +87,18 @@ def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> M
     if others.max() > _GEARED:
         motor, load = sorted((position, names[others.argmax()]), key=lambda name: -np.std(signals[name]))
         channels = {"theta_e": motor, "theta_s": load}
-    cutoff = 4.0 * find_bandwidth(signals[position], period, differentiate=True) or np.inf
-    _, velocity, acceleration = low_pass_motion(signals[position], cutoff, period)
-    rows = np.column_stack([acceleration, velocity, smooth_sign(velocity), np.ones(len(velocity))])
-    shares, found_period = dict[float, ColumnName](), None
+    torques, found_period = dict[float, ColumnName](), None
     for i in np.flatnonzero(~is_same & (others <= _GEARED)):
-        smooth = low_pass(moves[i], cutoff, period)
-        if abs(np.corrcoef(smooth, velocity)[0, 1]) < _SPEED:
-            shares[1.0 - residual_mean_square(smooth, rows) / float(np.var(smooth))] = names[i]
+        fit = fit_rigid_drive(moves[i], signals[position], [slice(0, moves.shape[1])], period)
+        if fit is None or fit.residual > _UNEXPLAINED:
+            continue
+        # a speed is the slope of the position, and takes no acceleration
+        if fit.shares[1] < _SPEED:
+            torques[fit.residual] = names[i]
         elif times is None:
-            ratio = float(np.std(velocity) / np.std(smooth))
+            ratio = 1.0 / abs(float(fit.values[1]))
             decade = 10.0 ** np.floor(np.log10(ratio))
             found_period = next((decade * digits for digits in _ROUND if abs(ratio / decade / digits - 1.0) < 0.01), None)
-    if shares and max(shares) > _EXPLAINED:
-        channels["u"] = shares[max(shares)]
+    if torques:
+        channels["u"] = torques[min(torques)]
     return MotionColumns(channels, found_period)
