@@ -38,7 +38,7 @@ def read_batch(source: Path, model: Path | None, out: Path, *, overwrite: bool) 
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; --batch needs one with logs")
-    logs = sorted(file for file in source.iterdir() if is_log(file))
+    logs = sorted(filter(is_log, source.iterdir()))
     file_names = {file.name for file in source.iterdir() if file.suffix != ".toml" and not file.name.startswith(".")}
     skipped = sorted(file_names - {"holdout", *(file.name for file in logs)})
     if not logs:
@@ -75,7 +75,7 @@ def run_batch(
         for row in (
             map_jobs(_diagnose_log, jobs, processes)
             if cluster is None
-            else cluster.map_jobs(_diagnose_log, [job.absolute() for job in jobs])
+            else cluster.map_jobs(_diagnose_log, map(LogJob.absolute, jobs))
         ):
             rows.append(row)
             progress(len(rows), count)
@@ -92,8 +92,9 @@ def _diagnose_log(job: LogJob) -> JsonObject:
     clear_programs_if_needed()
     try:
         task = read_diagnosis_task(job.log, job.model, holdout=job.holdout)
-        file = job.folder / "diagnosis.json"
-        return make_batch_row(job.log, run_or_read(task, file, run_diagnosis, write_report, overwrite=job.overwrite))
+        return make_batch_row(
+            job.log, run_or_read(task, job.folder / "diagnosis.json", run_diagnosis, write_report, overwrite=job.overwrite)
+        )
     except InputError as error:
         return make_batch_row(job.log, None, str(error))
 
