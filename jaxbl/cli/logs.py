@@ -128,13 +128,13 @@ def identify(
                 "anyway) and --next-experiment (which is for drives); leave these out"
             )
         from jaxbl.estimation.element import read_element_task, run_element
-        from jaxbl.report.element import describe as describe_element
+        from jaxbl.report.element import describe
 
         task, file = read_element_task(log[0], table, gear_ratio, holdout=holdout), folder / "identification.json"
         summary = run_or_read(task, file, run_element, jaxbl.write_report, overwrite=overwrite)
-        return Outcome(describe_element(summary), folder, summary=summary)
+        return Outcome(describe(summary), folder, summary=summary)
     from jaxbl.estimation.identify import read_identification_task, run_identification
-    from jaxbl.report.identify import describe as describe_identification
+    from jaxbl.report.identify import describe
 
     task = read_identification_task(log, model, holdout=holdout, profile=profile)
     if next_experiment is not None:
@@ -142,7 +142,7 @@ def identify(
 
         check_gap_sought(task)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
-    reports = describe_identification, after_identification
+    reports = describe, after_identification
     return _run_task(context, task, log_call, "identification.json", run_identification, *reports)
 
 
@@ -196,12 +196,12 @@ def diagnose(
         raise InputError("diagnose: no model; give a study with nominal parameters: --model TOML")
     workers.start_jax()
     from jaxbl.diagnosis.diagnose import read_diagnosis_task, run_diagnosis
-    from jaxbl.report.diagnose import describe as describe_diagnosis
+    from jaxbl.report.diagnose import describe
 
     task = read_diagnosis_task(log, model, holdout=holdout)
     folder = folder_of(log[0], "diagnosed", out)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
-    return _run_task(context, task, log_call, "diagnosis.json", run_diagnosis, describe_diagnosis, after_diagnosis)
+    return _run_task(context, task, log_call, "diagnosis.json", run_diagnosis, describe, after_diagnosis)
 
 
 def _run_task(

@@ -81,7 +81,7 @@ def _reasons(summary: JsonObject) -> Lines:
     """Say what stands against the answer, and what each effect is like."""
     doubts, lines = [], []
     for finding in summary["findings"]:
-        numbers, others = read_quantities(finding["parameters"]), finding["alternatives"]
+        numbers, alternatives = read_quantities(finding["parameters"]), finding["alternatives"]
         gain = 1.0 + numbers["relative"].value if "relative" in numbers else 1.0
         if not 1.0 / _FAR < gain < _FAR:
             doubts.append(
@@ -92,8 +92,8 @@ def _reasons(summary: JsonObject) -> Lines:
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
             f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}."
         )
-        if others:
-            names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in others)
+        if alternatives:
+            names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in alternatives)
             lines.append(f"Not ruled out by this log in place of {finding['effect']}: {names}.")
     lines = [*_contradiction_lines(summary), *summary["warnings"], *doubts, *_record_lines(summary), *lines]
     return [*lines, *_failed_checks(summary), *_table_lines(summary)]

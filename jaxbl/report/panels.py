@@ -342,7 +342,7 @@ def literal(name: str) -> str:
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-def packed(values: Any) -> str:
+def pack_numbers(values: Any) -> str:
     """Numbers for a page: float32, little-endian, in base64; the largest where they are larger."""
     clipped = np.clip(np.asarray(values, float), -_LARGEST, _LARGEST)
     return base64.b64encode(clipped.astype("<f4").tobytes()).decode()
@@ -369,11 +369,12 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
     content |= {kind: [] for kind in ("lines", "bands", "spans")}
     for part in map(thin, panel.parts):
         if isinstance(part, Line | Band | Span):
-            curves = {key: packed(values) for key, values in part._asdict().items() if key in ("x", "y", "low", "high")}
-            fields = part._asdict() | (curves if not isinstance(part, Span) else {})
-            content[f"{type(part).__name__.lower()}s"].append(fields | {"sorted": isinstance(part, Line) and part.is_sorted})
+            fields = part._asdict() | {"sorted": isinstance(part, Line) and part.is_sorted}
+            curves = () if isinstance(part, Span) else ("x", "y", "low", "high")
+            fields |= {key: pack_numbers(values) for key, values in fields.items() if key in curves}
+            content[f"{type(part).__name__.lower()}s"].append(fields)
         elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
-            cells = {key: packed(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
+            cells = {key: pack_numbers(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
             scale = part.scale._asdict()
             content["cells"] = cells | {"name": scale.pop("label").replace("\n", " ")} | scale
     return to_jsonable(content)

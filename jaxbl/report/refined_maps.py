@@ -37,10 +37,10 @@ class Filling:
         positions = zip(self._values, self._cells, (frame[path] for path in self.paths), strict=True)
         return np.stack([np.searchsorted(values, column) / cell for values, cell, column in positions], axis=1)
 
-    def _nearest(self, known: DataFrame, asked: DataFrame) -> Array:
-        """The known row nearest to each row asked for, within half a coarse cell; their number where there is none."""
+    def _nearest(self, simulated: DataFrame, asked: DataFrame) -> Array:
+        """The simulated row nearest to each row asked for, within half a coarse cell; their number where there is none."""
         # of two that are as near the upper one
-        return KDTree(self._places(known)).query(self._places(asked) + 1e-6, p=np.inf, distance_upper_bound=0.50001)[1]
+        return KDTree(self._places(simulated)).query(self._places(asked) + 1e-6, p=np.inf, distance_upper_bound=0.50001)[1]
 
     def dense(self, table: Series) -> tuple[Array, Array, Array]:
         """Values of x `(columns,)` and y `(rows,)`, and a table over (y, x) on the whole plane `(rows, columns)`."""

@@ -6,6 +6,7 @@ import pytest
 from small_study import ALPHA, LAMBDA, make_result, rigid_study, spaced_axis
 
 import jaxbl
+from jaxbl.json_types import JsonObject
 from jaxbl.report import results
 
 
@@ -34,9 +35,10 @@ def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):
 
 def test_each_kind_of_result_goes_to_its_own_functions():
     for kind, functions in results._KINDS.items():
-        first = [next(iter(inspect.signature(function).parameters.values())).annotation for function in functions[:3]]
-        # some are described by their summary alone
-        assert first[0] in (kind, inspect.Parameter.empty) and set(first[1:]) == {kind}
+        calls = (getattr(functions.report, name) for name in ("describe", "draw", "write"))
+        first = [next(iter(inspect.signature(call).parameters.values())).annotation for call in calls]
+        # logs are described by their summary alone
+        assert first[0] in (kind, JsonObject) and set(first[1:]) == {kind}
 
 
 def test_what_is_no_result_or_no_figure_is_said(study, tmp_path):

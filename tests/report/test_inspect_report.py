@@ -69,9 +69,11 @@ def test_the_card_fits_a_terminal_whatever_is_wrong(tmp_path):
     lines = format_result(result, ["report.html"])
     assert len(lines) <= 8 and all(len(line) <= 100 for line in lines)
     assert result.verdict == "doubtful" and len(result.details) > 3
-    assert result.tables[1].columns == (
-        "channel", "unit", "least", "largest", "resolution", "noise", "bandwidth", "saturated", "jumps", "skew"
-    )  # fmt: skip
+    channels = result.tables[1]
+    assert channels.columns[4:] == [
+        "resolution", "noise", "bandwidth (Hz)", "saturated", "jumps", "skew (ms)", "standard error"
+    ]  # fmt: skip
+    assert [row[0] for row in channels.rows] == list(inspection.record.statistics.channels)
 
 
 def test_the_report_holds_table_figures_and_how_the_log_was_read(tmp_path):

@@ -16,7 +16,7 @@ from jaxbl.files import write_atomic
 from jaxbl.lines import NextStep
 from jaxbl.report.drawing import Picture
 from jaxbl.report.page import format_page
-from jaxbl.report.panels import packed
+from jaxbl.report.panels import pack_numbers
 from jaxbl.report.results import describe, write_report
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.trial import run
@@ -194,8 +194,8 @@ def signal_panel(top, label, slope):
     line = {
         "name": "seen",
         "colour": "#000000",
-        "x": packed(time),
-        "y": packed(values),
+        "x": pack_numbers(time),
+        "y": pack_numbers(values),
         "sorted": True,
         "width": 1.5,
         "dashes": "--",
@@ -214,9 +214,9 @@ def signal_panel(top, label, slope):
                 "name": "95 %",
                 "colour": "#0072B2",
                 "opacity": 0.2,
-                "x": packed(time),
-                "low": packed(values - 1.0),
-                "high": packed(values + 1.0),
+                "x": pack_numbers(time),
+                "low": pack_numbers(values - 1.0),
+                "high": pack_numbers(values + 1.0),
             }
         ],
         "spans": [

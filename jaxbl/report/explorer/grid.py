@@ -18,7 +18,7 @@ from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.gain_plane import least_lambdas
 from jaxbl.report.maps import axis_words, best_gains, worst_runs
-from jaxbl.report.panels import packed
+from jaxbl.report.panels import pack_numbers
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -165,9 +165,9 @@ def _stars(
     return stars
 
 
-def _place_in_all(others: Sequence[int], x: int, y: int) -> Array:
-    """The place along all dimensions of one along those that are not drawn."""
-    return np.insert(np.array(others, int), [min(x, y), max(x, y) - 1], 0)
+def _place_in_all(hidden: Sequence[int], x: int, y: int) -> Array:
+    """The place along all dimensions of one along those that are hidden."""
+    return np.insert(np.array(hidden, int), [min(x, y), max(x, y) - 1], 0)
 
 
 def _overview(values: Array) -> JsonObject:
@@ -175,7 +175,7 @@ def _overview(values: Array) -> JsonObject:
     steps = [-(-size // _OVERVIEW) for size in values.shape[1:]]
     samples = np.moveaxis(np.array(values[:, :: steps[0], :: steps[1]]), 0, -1)
     cells = pd.DataFrame(samples.reshape(-1, samples.shape[-1])).median(axis=1).to_numpy().reshape(samples.shape[:-1])
-    return {"shape": list(cells.shape), "values": packed(cells)}
+    return {"shape": list(cells.shape), "values": pack_numbers(cells)}
 
 
 def _conditions() -> list[JsonObject]:

@@ -15,7 +15,7 @@ from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.report.error_plane import error_path, plane_reach
 from jaxbl.report.maps import value_label
-from jaxbl.report.panels import MAP, packed
+from jaxbl.report.panels import MAP, pack_numbers
 from jaxbl.report.sweep import answer_sweep
 from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity
@@ -154,15 +154,15 @@ def simulated(config: Config, asked: Any) -> JsonObject:
         path = error_path(trial.trace, side, judged)
         e, slope = path.majorant
         planes[side] = {
-            "error": packed(drawable(path.error)),
-            "slope": packed(drawable(path.slope)),
+            "error": pack_numbers(drawable(path.error)),
+            "slope": pack_numbers(drawable(path.slope)),
             "reach": [plane_reach(path.error, e), plane_reach(path.slope, slope)],
-            "majorant": [packed(e), packed(slope)] if len(e) else None,
+            "majorant": [pack_numbers(e), pack_numbers(slope)] if len(e) else None,
         }
     return {
         "every": step,
         "metrics": trial.summary["metrics"],
-        "columns": {name: packed(drawable(trace[name])) for name in _COLUMNS if name in trace},
+        "columns": {name: pack_numbers(drawable(trace[name])) for name in _COLUMNS if name in trace},
         "planes": planes,
         "config": point.to_toml(),
     }
