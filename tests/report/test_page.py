@@ -119,7 +119,6 @@ def test_page_of_a_sweep(tmp_path):
         "a <b> c",
         "first remark",
         "observer.discretisation",
-        "motor.convergence_time_bound",
     ):
         assert text in page.text
 
@@ -146,7 +145,14 @@ def test_figures_say_their_values_and_zoom_and_tables_sort(tmp_path):
     axes = [spaced_axis(ALPHA, 1.0, 50.0, 5), spaced_axis(LAMBDA, 1.0, 20.0, 4)]
     result = make_result(rigid_study(axes=axes), motor__velocity_rmse=lambda frame: frame[ALPHA] * frame[LAMBDA])
     long = NextStep(f"jaxbl explore {'a_long_folder/' * 30} --static page", "How do other metrics look?")
-    write_report(result, tmp_path, dataclasses.replace(describe(result), next_steps=[long]))
+    rows = [
+        ["motor.velocity_rmse", "rad/s", 3.5],
+        ["load.torque_rmse", "N m", None],
+        ["chatter", "rad/s", 20.0],
+        ["a", "", 0.1],
+    ]
+    table = ResultTable("Medians", ["metric", "unit", "median"], rows)
+    write_report(result, tmp_path, dataclasses.replace(describe(result), next_steps=[long], tables=[table]))
     with open_pages(tmp_path / "report.html", color_scheme="dark") as (page,):
         check_figures(page, 1)
         view, values = page.locator(".view"), page.locator(".values")
@@ -315,7 +321,6 @@ def test_pages_of_studies_that_nobody_expects(tmp_path):
         page_by_study = dict(zip(studies, pages, strict=True))
         assert page_by_study["texts"].locator("h1").text_content() == title
         assert page_by_study["texts"].get_by_text(title, exact=True).count() == 3
-        assert page_by_study["map"].locator("table").first.locator("td", has_text="10000").count() == 1
         assert page_by_study["gone"].get_by_text("10 runs diverged").count() == 1
 
 
