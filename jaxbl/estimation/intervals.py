@@ -85,8 +85,10 @@ def spread_of(
     size = np.where(size > 0.0, size, 1.0)
     scores = np.einsum("wtsp,wts->wtp", jacobian / size, residual).reshape(windows * samples, parameters) / variance
     middle = long_run(scores, least) * np.outer(size, size) * residual.size / freedom + prior
-    plain = invert(information)
-    covariance, inflation = without_gain(plain @ middle @ plain, plain)
+    plain, (sizes, ways) = invert(information), np.linalg.eigh(middle)
+    # by a root of the middle: never negative, whatever rounding does
+    half = plain @ (ways * np.sqrt(np.maximum(sizes, 0.0)))
+    covariance, inflation = without_gain(half @ half.T, plain)
     return Spread(covariance, information, variance, inflation)
 
 

@@ -171,9 +171,9 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
     """
     signals = {column: file.load_values(column) for column in file.columns}
     times = next((candidate.values for candidate in candidates.get("t", ())), None)
-    found: dict[str, ColumnName] = {}
+    by_values: dict[str, ColumnName] = {}
     if times is None and (stamps := find_stamps(signals)) is not None:
-        found["t"], times = stamps, signals[stamps]
+        by_values["t"], times = stamps, signals[stamps]
     table: _Table = {}
     if not _POSITIONS & {*candidates}:
         named = {candidate.column for columns in candidates.values() for candidate in columns}
@@ -184,13 +184,13 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
             if values.dtype.kind in "iuf" and not rises_evenly(values) and np.isfinite(values).all() and np.ptp(values)
         }
         channels, period = find_moving_columns(moving, times)
-        found |= {channel: column for channel, column in channels.items() if channel not in candidates}
+        by_values |= {channel: column for channel, column in channels.items() if channel not in candidates}
         if times is None and period is not None:
             table["t"] = {"period": period}
             guesses.append(f"The period is taken to be {period:g} s: a speed then is the slope of the position.")
-    for channel, column in found.items():
-        for other, others in [*candidates.items()]:
-            candidates[other] = [candidate for candidate in others if candidate.column != column]
+    for channel, column in by_values.items():
+        for other, columns in [*candidates.items()]:
+            candidates[other] = [candidate for candidate in columns if candidate.column != column]
             if not candidates[other]:
                 del candidates[other]
         candidates[channel] = [_Candidate(False, column, *_split_unit(file, column), signals[column])]

@@ -50,8 +50,8 @@ def find_latest(signals: _Signals) -> ColumnName:
     """Return the latest column of the same motion as the first one: a reference leads what follows it."""
     from scipy.signal import correlate
 
-    latest, *others = signals
-    for column in others:
+    latest, *later = signals
+    for column in later:
         before, after = (signals[name] - np.mean(signals[name]) for name in (latest, column))
         size = float(np.linalg.norm(before) * np.linalg.norm(after)) or np.inf
         is_same = abs(np.std(after) - np.std(before)) < _SAME_SIZE * np.std(before)
@@ -78,17 +78,13 @@ def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> M
     likeness = moves @ moves[first] / (moves.shape[1] * size * size[first])
     is_same = (likeness > _SAME) & (np.abs(size / size[first] - 1.0) < _SAME_SIZE)
     position = find_latest({names[i]: signals[names[i]] for i in np.flatnonzero(is_same)})
-    sides = [(size[first], position)]
-    others = np.where(is_same, 0.0, np.abs(likeness))
-    if others.max() > _GEARED:
-        sides.append((size[others.argmax()], names[others.argmax()]))
     channels: dict[str, ColumnName] = {"theta_e": position}
-    others = np.where(is_same, 0.0, np.abs(likeness))
-    if others.max() > _GEARED:
-        motor, load = sorted((position, names[others.argmax()]), key=lambda name: -np.std(signals[name]))
+    geared = np.where(is_same, 0.0, np.abs(likeness))
+    if geared.max() > _GEARED:
+        motor, load = sorted((position, names[geared.argmax()]), key=lambda name: -np.std(signals[name]))
         channels = {"theta_e": motor, "theta_s": load}
     torques, found_period = dict[float, ColumnName](), None
-    for i in np.flatnonzero(~is_same & (others <= _GEARED)):
+    for i in np.flatnonzero(~is_same & (geared <= _GEARED)):
         fit = fit_rigid_drive(moves[i], signals[position], [slice(0, moves.shape[1])], period)
         if fit is None or fit.residual > _UNEXPLAINED:
             continue

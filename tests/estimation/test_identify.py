@@ -138,9 +138,9 @@ def test_report_has_every_number_and_figure(identification, tmp_path):
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"identification.json", "model.toml", "trace.parquet", "figures", "manifest.json", "report.html"}
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
-    assert drawn == {"intervals", "residuals", "hysteresis"}
-    page = (tmp_path / "report.html").read_text()
-    assert all(path in page for path in TRUTH)
+    assert drawn == {"residuals", "hysteresis"}
+    page = (tmp_path / "report.html").read_text().replace("<wbr>", "")
+    assert [path for path in TRUTH if path not in page] == []
 
 
 def drop_excitation_and_gains(study):
@@ -222,7 +222,7 @@ def test_model_replays_the_log_where_the_study_has_no_excitation(full_identifica
     excitation = prepare(read_config(tmp_path / "model.toml")).excitation
     torque = jax.vmap(excitation)(jnp.asarray(full_identification.trace["t"]))
     np.testing.assert_allclose(torque, full_identification.trace["u"], atol=1e-12)
-    page = (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text().replace("<wbr>", "")
     assert "by profile from" in page
 
 
