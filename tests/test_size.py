@@ -9,23 +9,24 @@ from size import ROOT, Size, measure_file, measure_folders
 
 # tokens; percent of vague names, of functions named by a participle, of docstrings without a subject.
 # Lowered to what is reached; raised only where an issue names a new sum, in the commit that says why. In all: for the
-# engine as functions and the loop closed a sum of 10 000 above 393 921 is named, and 6 100 of these are spent.
+# engine as functions and the loop closed a sum of 10 000 above 393 921 is named, and none of these is needed.
 # `control` and what it needs of `gains`, `sweeps`, `.`, `config`, `drive`, `fused` and `exports` are of the loop closed
 # and of drives of one's own; `records`, `monitoring`, `.`, `cli` and `exports` are above what they were by streams that
 # do not go blind, costs said beforehand, logs read without a hand, and C and structured text in float at any turn;
 # `observer` by numbers that survive a standstill, `estimation` by rigs with play and slip and the test for bias by
-# feedback. `report` pays for all.
+# feedback; `records` by files without telling names, and `fused` by compilation, which moved
+# there from `estimation`. `report` pays for all.
 CEILINGS = {
-    "all": (393150, 0.02, 0.2, 0.0),
+    "all": (392779, 0.02, 0.2, 0.0),
     "report": (45201, 0.04, 0.56, 0.0),
-    "diagnosis": (59514, 0.0, 0.0, 0.0),
-    "records": (51691, 0.0, 0.0, 0.0),
+    "diagnosis": (58767, 0.0, 0.0, 0.0),
+    "records": (52991, 0.0, 0.0, 0.0),
     "gains": (38771, 0.0, 0.0, 0.0),
-    "estimation": (34243, 0.0, 0.0, 0.0),
+    "estimation": (32250, 0.0, 0.0, 0.0),
     "sweeps": (30249, 0.08, 0.0, 0.0),
     "exports": (24343, 0.02, 0.0, 0.0),
-    "fused": (24286, 0.0, 0.0, 0.0),
-    ".": (23320, 0.0, 0.0, 0.0),
+    "fused": (25356, 0.0, 0.0, 0.0),
+    ".": (23319, 0.0, 0.0, 0.0),
     "drive": (13099, 0.0, 1.6, 0.0),
     "throughput": (10661, 0.0, 0.0, 0.0),
     "cli": (9738, 0.09, 0.0, 0.0),
