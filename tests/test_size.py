@@ -17,9 +17,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # feedback; `records` by files without telling names, and `fused` by compilation, which moved
 # there from `estimation`. `report` pays for all.
 CEILINGS = {
-    "all": (392779, 0.02, 0.2, 0.0),
-    "report": (45201, 0.04, 0.56, 0.0),
-    "diagnosis": (58767, 0.0, 0.0, 0.0),
+    "all": (393009, 0.02, 0.2, 0.0),
+    "report": (45394, 0.04, 0.56, 0.0),
+    "diagnosis": (58804, 0.0, 0.0, 0.0),
     "records": (52991, 0.0, 0.0, 0.0),
     "gains": (38771, 0.0, 0.0, 0.0),
     "estimation": (32250, 0.0, 0.0, 0.0),

@@ -127,13 +127,20 @@ class Choice:
         return Chosen(explanation, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
     def _keep_likely(self, explanation: Explanation) -> tuple[Explanation, tuple[Finding, ...]]:
-        """Leave out effects in whose place something unknown is likelier, one after the other."""
+        """Leave out effects in whose place something unknown is likelier, if blocks do not show them beyond doubt."""
         while True:
             findings = weigh(explanation, self._find_left(explanation.fitted)[0] if explanation.fitted.names else 0.0)
-            unlikely = [f for f in findings if not f.is_likely and f.effect not in self.search.expected]
+            unlikely = [
+                finding
+                for finding in findings
+                if not finding.is_likely
+                and finding.effect not in self.search.expected
+                and explanation.gains[finding.effect].standard_errors < LIMITS.far
+            ]
             if not unlikely:
                 return explanation, findings
-            explanation = self.search.leave_out(explanation, min(unlikely, key=lambda f: f.confidence).effect)
+            least = min(unlikely, key=lambda finding: finding.confidence)
+            explanation = self.search.leave_out(explanation, least.effect)
 
     def _find_left(self, fitted: FittedModel) -> tuple[float, list[str]]:
         """Find the torque that a model leaves of the log where a complete one would leave less, over the driving torque, and

@@ -62,7 +62,8 @@ def best_runs(
     if indices is not None:
         windows, within = windows.only(indices), within[indices]
     if not len(within):
-        return Run(windows.finer, start, np.zeros(len(experiment.sides)))
+        states = jax.tree.map(lambda _: windows.torque, start)
+        return Run(windows.finer, states, np.zeros(len(experiment.sides)))
     first = count_seen(windows.torque.shape[1])
     starts = seek_starts(experiment, windows, passes, at_rest, first, within)
     (columns, size), later = over_size(starts.slope[:, :first]), starts.slope[:, first:]

@@ -53,7 +53,10 @@ class Thresholds:
         default=100.0,
     )  # fmt: skip
     far: float = parameter(
-        "standard deviations", "of its prior, beyond which a number of the model hardly lies: one in a million", default=5.0
+        "standard deviations",
+        "of its prior, beyond which a number of the model hardly lies, and from which on blocks show an effect beyond "
+        "doubt: one in a million",
+        default=5.0,
     )
     failing: float = parameter(
         "probability", "that a complete model fails the test on held-out data, in any channel", default=0.01

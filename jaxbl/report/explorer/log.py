@@ -77,7 +77,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         or float(np.median(np.diff(frame["t"].to_numpy(float)))),
         "held": "held_out" in frame and bool(frame["held_out"].any()),
         "coordinates": coordinates,
-        "over": [line["column"] for line in coordinates[1:3]],
+        "over": _first(summary, frame) or [line["column"] for line in coordinates[1:3]],
         "groups": groups,
         "colours": colours_of("PuOr_r"),
     }
@@ -142,6 +142,21 @@ def _coordinates(frame: DataFrame, units: Mapping[str, str]) -> Iterable[dict[st
         ):
             if f"{side}.{name}" in frame:
                 yield {"column": f"{side}.{name}", "label": f"{side} {label}", "unit": units[side] + per}
+
+
+_NAMES = {
+    "speed": "motor.velocity", "turn": "motor.turn", "position": "theta_e", "load position": "theta_s",
+    "load turn": "load.turn", "twist": "twist", "input": "u", "displacement": "displacement",
+}  # fmt: skip
+"""Columns of what a diagnosis looks at missing torques along."""
+
+
+def _first(summary: JsonObject, frame: DataFrame) -> list[str]:
+    """Two coordinates that a log is looked at over at first: of a diagnosis those that explain most on the motor's side."""
+    coordinates = summary.get("where", {}).get("motor", {}).get("coordinates", {})
+    names = [name for name, column in _NAMES.items() if column in frame]
+    names.sort(key=lambda name: -(coordinates.get(name, {}).get("explained") or 0.0))
+    return [_NAMES[name] for name in names[:2]]
 
 
 def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> Iterable[JsonObject]:

@@ -136,15 +136,19 @@ class ExplorerServer(ThreadingHTTPServer):
             return False
         with self._lock:
             again = version in self._loaded
-            self._loaded.add(version)
+            if version in self._version_names():
+                self._loaded.add(version)
             return again and (self._stale or version != str(self._versions))
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
-        folder = self._place / version
-        if not version.isdecimal() or not folder.is_dir():
+        folder = self._place / version if version in self._version_names() else None
+        if folder is None or not folder.is_dir():
             return None
         return next((file for file in folder.iterdir() if file.name == name and file.is_file()), None)
+
+    def _version_names(self) -> Iterator[str]:
+        return map(str, range(1, self._versions + 1))
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -60,8 +60,8 @@ def test_columns_and_what_is_said_of_them(tmp_path):
     )
     units = {coordinate["column"]: coordinate["unit"] for coordinate in log["coordinates"]}
     assert units["motor.velocity"] == "rad/s" and units["u"] == "N m" and log["held"]
-    # over input and position
-    assert log["over"] == ["u", "theta_e"]
+    # over what explains most
+    assert log["over"] == ["theta_e", "motor.turn"]
     (group,) = log["groups"]
     assert (group["name"], group["unit"], group["bandwidth"]) == ("motor: missing torque", "N m", 40.0)
     assert {coordinate["column"]: coordinate["label"] for coordinate in group["lines"]} == {
@@ -126,7 +126,7 @@ def test_lines_coordinates_and_moments(tmp_path):
     with open_pages(tmp_path / "index.html") as (page,):
         page.wait_for_selector("body[data-drawn*='motor.missing_before motor.missing_after']")
         assert page.locator("#title").text_content() == page.locator("#lead").text_content() == HOSTILE
-        assert page.locator("#overhead").inner_text().startswith("Over input u, and over")
+        assert page.locator("#overhead").inner_text().startswith("Over motor position θe, and over")
 
         def read_sizes():
             rows = (row.split("\t") for row in page.locator("#sizes tbody tr").all_inner_texts())
