@@ -174,7 +174,7 @@ def test_a_worker_the_client_and_the_scheduler_are_killed(tmp_path, undisturbed_
                 client.join()
                 before = expected_frame(folder, expected)
                 client = start_process(_sweep, folder, address)
-                wait_until(lambda: count_parts(folder) >= 60)
+                wait_until(lambda: count_parts(folder) >= 40)
         # the scheduler is gone
         client.join(60.0)
         assert client.exitcode == 1
