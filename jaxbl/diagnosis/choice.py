@@ -101,7 +101,7 @@ class Choice:
         self.search = EffectSearch(setup.bare, setup.free, prior, self.log, exact, stated.expected, self._check_input)
         self.search.history += history
         self.before = self.log.compare(setup.nominal)
-        self._left: tuple[FittedModel, float, list[str]] | None = None
+        self._missing: tuple[FittedModel, float, list[str]] | None = None
 
     def _check_input(self, fitted: FittedModel) -> None:
         """End the search if a model shows that the machine did not feel noise of the input that drives models."""
@@ -129,7 +129,7 @@ class Choice:
     def _keep_likely(self, explanation: Explanation) -> tuple[Explanation, tuple[Finding, ...]]:
         """Leave out effects in whose place something unknown is likelier, if blocks do not show them beyond doubt."""
         while True:
-            findings = weigh(explanation, self._find_left(explanation.fitted)[0] if explanation.fitted.names else 0.0)
+            findings = weigh(explanation, self._find_missing(explanation.fitted)[0] if explanation.fitted.names else 0.0)
             unlikely = [
                 finding
                 for finding in findings
@@ -142,22 +142,22 @@ class Choice:
             least = min(unlikely, key=lambda finding: finding.confidence)
             explanation = self.search.leave_out(explanation, least.effect)
 
-    def _find_left(self, fitted: FittedModel) -> tuple[float, list[str]]:
+    def _find_missing(self, fitted: FittedModel) -> tuple[float, list[str]]:
         """Find the torque that a model leaves of the log where a complete one would leave less, over the driving torque, and
         the channels in which it leaves more."""
-        if self._left is None or self._left[0] is not fitted:
+        if self._missing is None or self._missing[0] is not fitted:
             driving, compared = self.search.fits.given.drive, self.log.compare(fitted.experiment)
             expected = expected_errors(self.log, fitted, compared, self.setup.input_noise, driving)
             failed = list_failed(self.log.with_slow(compared), expected)
             torque = missing_power(fitted.experiment, compared.errors, expected) ** 0.5 if failed else 0.0
-            self._left = fitted, torque / driving, failed
-        return self._left[1:]
+            self._missing = fitted, torque / driving, failed
+        return self._missing[1:]
 
     def tabulate(self, chosen: Chosen, lacking: SideResiduals) -> Tabulation | None:
         """Tabulate what no known effect explains, where something is left; `lacking`: the torque that is."""
         fitted = chosen.fitted
         away = np.abs(fitted.theta[: len(chosen.prior)]) / chosen.prior
-        if np.max(away, initial=0.0) > LIMITS.far or not self._find_left(fitted)[1]:
+        if np.max(away, initial=0.0) > LIMITS.far or not self._find_missing(fitted)[1]:
             return None
         tables = tabulate(self.log, fitted.experiment, chosen.compared, lacking, self.setup.sliding)
         z, reason = (None, "no table predicts better") if tables is None else (tables.z, "predicts better, and has no name")

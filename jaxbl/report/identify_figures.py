@@ -50,7 +50,7 @@ def _residuals(log: LogSignals) -> Figure:
     return stack(
         "residuals",
         panels,
-        "Measured position less that of the fitted model, window by window. Noise alone leaves the dashed lines in one "
+        "Measured position less that of the fitted model, window by window. Noise alone crosses the lines at ± 2 in one "
         "sample of twenty; longer swings beyond them are an effect that the model lacks.",
         2.0,
     )

@@ -76,8 +76,8 @@ def describe(inspection: Inspection) -> Result:
 
 
 def _channel_table(record: Record) -> ResultTable:
-    columns = ["channel", "unit", "least", "largest", "resolution", "noise", "bandwidth (Hz)", "saturated", "jumps",
-               "skew (ms)", "standard error"]  # fmt: skip
+    columns = ["channel", "unit", "least", "largest", "resolution", "noise", "bandwidth (Hz)", "saturated (share)", "jumps",
+               "skew (ms)", "standard error (ms)"]  # fmt: skip
     rows = []
     for name, c in record.statistics.channels.items():
         skew = [None if seconds is None else 1e3 * seconds for seconds in (c.skew, c.skew_error)]

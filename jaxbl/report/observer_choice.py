@@ -3,8 +3,12 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false
 
+import math
 from collections import Counter
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -13,61 +17,66 @@ from jaxbl.config import Config
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import Lines
-from jaxbl.result import Result, ResultTable
+from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .maps import axis_label
+from .maps import axis_label, with_value
 from .panels import (
     SIDE_COLOURS,
     Axis,
     Figure,
+    Line,
+    Map,
     Panel,
     Part,
+    Scale,
     Span,
+    arrange,
     intervals,
     name_rows,
     place_words,
+    tick_text,
 )
 from .tune import error_label, for_title, write_gains
 
 
 def draw(choice: ObserverChoice) -> list[Figure]:
-    """Draw each kind's error over the best one's with its interval, over all points, a panel for each side."""
-    summary, panels = choice.summary, []
-    points = summary["points"]
-    for side in points[0]["sides"]:
-        results = [point["sides"][side] for point in points]
-        wins, rows, lost = Counter(result["best"] for result in results), {}, []
-        for kind in summary["observers"]:
-            compared = [result["kinds"][kind] for result in results if result["kinds"][kind]["ratio"] is not None]
-            if not compared:
-                lost.append(kind)
-                continue
-            low, ratio, high = (np.array([result[key] for result in compared]) for key in ("low", "ratio", "high"))
-            text = _ratio(compared[0]) if len(points) == 1 else ""
-            if wins[kind]:
-                text = "best" if len(points) == 1 else f"best at {wins[kind]} of {len(points)} points"
-            elif len(compared) < len(points):
-                text = f"diverges, or is too slow, at {len(points) - len(compared)}"
-            rows[kind] = np.median(ratio), low.min(), high.max(), text
-        rows = dict(sorted(rows.items(), key=lambda row: row[1][0]))
-        ratio, low, high, texts = zip(*rows.values(), strict=True) if rows else ((),) * 4
-        names = [*rows, *lost]
+    """All figures of a choice: intervals for a single point, else a map for each side."""
+    summary = choice.summary
+    sides = list(summary["points"][0]["sides"])
+    if len(summary["points"]) == 1:
+        return [_ratios(summary, sides)]
+    return [_map(choice.config, summary, side) for side in sides]
+
+
+def _sort_kinds(kinds: JsonObject) -> tuple[dict[str, JsonObject], list[str]]:
+    """Kinds with a ratio, best first, and names of those without."""
+    compared = {kind: result for kind, result in kinds.items() if result["ratio"] is not None}
+    return compared, [kind for kind in kinds if kind not in compared]
+
+
+def _ratios(summary: JsonObject, sides: Sequence[str]) -> Figure:
+    """Ratios with their intervals, a panel for each side."""
+    panels = []
+    for side in sides:
+        kinds = summary["points"][0]["sides"][side]["kinds"]
+        compared, lost = _sort_kinds(kinds)
+        highest = max((result["high"] for result in compared.values()), default=1.0)
+        low, ratio, high = (np.array([result[key] for result in compared.values()]) for key in ("low", "ratio", "high"))
+        texts = ["best" if i == 0 else _ratio(result) for i, result in enumerate(compared.values())]
+        texts += ["diverged, or too slow"] * len(lost)
         parts: list[Part] = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
-            *intervals(range(len(rows)), low, ratio, high, colour=SIDE_COLOURS[side]),
-            place_words(high, range(len(rows)), texts),
-            place_words([0.9] * len(lost), range(len(rows), len(names)), ["diverged, or too slow"] * len(lost)),
+            *intervals(range(len(compared)), low, ratio, high, colour=SIDE_COLOURS[side]),
+            place_words([*high, *[0.9] * len(lost)], range(len(kinds)), texts),
         ]
-        x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + max(high, default=1.0)) ** 1.5))
-        panels.append(Panel(x, name_rows(names), parts, side))
+        x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + highest) ** 1.5))
+        panels.append(Panel(x, name_rows([*compared, *lost]), parts, side))
     caption = (
         f"{error_label(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with "
         "its 95 % interval where they differ."
     )
-    if len(points) > 1:
-        caption += f" Of {len(points)} points the median, and the range of their intervals."
     height = 0.9 + 0.34 * len(summary["observers"])
-    return [Figure("observers", panels, caption, len(panels), 5.2 * len(panels), height)]
+    return Figure("observers", panels, caption, len(sides), 5.2 * len(sides), height)
 
 
 _RATIO = "ratio", "low", "high"
@@ -79,6 +88,77 @@ def _ratio(result: JsonObject) -> str:
     return ratio if runs_are_equal(result) else f"{ratio} ({low} to {high})"
 
 
+def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, list[Any]]:
+    """Values of the axes that have several, in their order; of axes that advance together, those of the side's own, or of
+    the first."""
+    together: dict[str, list[str]] = {}
+    for axis in config.tune.axes if config.tune is not None else ():
+        together.setdefault(axis.zip or axis.path, []).append(axis.path)
+    paths = [min(zipped, key=lambda path: f".{side}_" not in path) for zipped in together.values()]
+    columns = {path: list(dict.fromkeys(point["values"][path] for point in summary["points"])) for path in paths}
+    return {path: values for path, values in columns.items() if len(values) > 1}
+
+
+def short_names(kinds: Sequence[str]) -> dict[str, str]:
+    """Few letters for each kind: the initials of its words, with a number in full, and a stroke where two are the same."""
+    names: dict[str, str] = {}
+    for kind in kinds:
+        name = "".join(word if word.isdigit() else word[0].upper() for word in kind.split("_"))
+        while name in names.values():
+            name += "'"
+        names[kind] = name
+    return names
+
+
+def _axis(config: Config, path: str, values: Sequence[Any]) -> Axis:
+    """An axis with its values in words, evenly."""
+    texts = [tick_text(value) if isinstance(value, int | float) else str(value) for value in values]
+    return Axis(axis_label(config, path), path, ends=(-0.5, len(values) - 0.5), names=tuple(enumerate(texts)))
+
+
+def _map(config: Config, summary: JsonObject, side: str) -> Figure:
+    """The best kind at each point; a panel for each value of further axes."""
+    varied, short, kinds = _varied_values(config, summary, side), short_names(summary["observers"]), summary["observers"]
+    # over one axis a map has a single row
+    (x, xs), (y, ys), *_ = [*reversed(varied.items()), ("", [None])]
+    further = {path: values for path, values in varied.items() if path not in (x, y)}
+    points = {
+        tuple(point["values"].get(path) for path in (*further, y, x)): point["sides"][side] for point in summary["points"]
+    }
+    x_axis, y_axis = _axis(config, x, xs), _axis(config, y, ys) if y else Axis(names=((0.0, ""),))
+    edges = [np.arange(len(values) + 1) - 0.5 for values in (xs, ys)]
+    scale = Scale(-0.5, 9.5, "", colours="tab10")
+    numbers = {kind: i % 10 for i, kind in enumerate(kinds)}
+    winners = {point["best"] for point in points.values()} - {None}
+    panels, columns = [], arrange(math.prod(map(len, further.values())))
+    for values in product(*further.values()):
+        cells = [[points[*values, v, u] for u in xs] for v in ys]
+        best = np.array([[numbers.get(cell["best"], np.nan) for cell in row] for row in cells])
+        texts = [_cell_text(cell, short) for row in cells for cell in row]
+        place_x, place_y = (axis.ravel() for axis in np.meshgrid(*map(np.arange, best.shape[::-1])))
+        winners_map = Map(*edges, best, scale, np.isnan(best), "all diverge, or are too slow")
+        parts = [winners_map, Line(place_x, place_y, width=0.0, texts=texts)]
+        title = ", ".join(with_value(config, *pair) for pair in zip(further, values, strict=True))
+        panels.append(Panel(x_axis, y_axis, parts, title))
+    names = ", ".join(f"{short[kind]}: {kind}" for kind in kinds if kind in winners)
+    caption = (
+        f"{side}: the kind with the least {error_label(summary)} at each point ({names}), {_where(summary)}, and below it "
+        f"how many times that error {kinds[0]} ({short[kinds[0]]}) has (–: diverged). An equals sign: another kind's error "
+        "may be as small (95 % interval)."
+    )
+    width, height = max(0.95 * len(xs), 2.6) * columns + 1.0, max(0.72 * len(ys), 1.6) + 0.7
+    return Figure(f"observers_{side}", panels, caption, columns, width, height)
+
+
+def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
+    """The best kind at a point in letters, and how many times its error the first kind has."""
+    best, (reference, *_) = point["best"], short
+    if best is None:
+        return ""
+    text, ratio = short[best] + ("=" if point["not_told_apart"] else ""), point["kinds"][reference]["ratio"]
+    return text if best == reference else f"{text}\n{short[reference]} {'–' if ratio is None else f'×{ratio:.2g}'}"
+
+
 def write(choice: ObserverChoice, folder: Path) -> str:
     """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
     return write_gains(choice, folder, observer_toml(choice.summary))
@@ -88,15 +168,22 @@ def describe(choice: ObserverChoice) -> Result:
     """Say which kind of observer is best, and by how much."""
     config, summary = choice.config, choice.summary
     points, kind = summary["points"], summary.get("for_both_sides")
+    figures = []
+    for side in points[0]["sides"]:
+        best = Counter(point["sides"][side]["best"] for point in points)
+        del best[None]
+        for name, count in best.most_common(1):
+            share = f"best at {count} of {len(points)} points" if len(points) > 1 else "best"
+            figures.append(KeyFigure(name, f"{side}: {share} ({summary['objective']} error, {_where(summary)})"))
     verdict, headline = "good", f"Take {kind}: gains.toml has its gains."
-    if not any(result["best"] for point in points for result in point["sides"].values()):
+    if not figures:
         verdict, headline = "failed", "All kinds of observers diverge, or are too slow."
     elif kind is None:
-        headline = "Which observer is best depends on the point; the tables show where."
+        headline = "Which observer is best depends on the point; the map shows where."
         if len(points) == 1:
             verdict, headline = "doubtful", "No kind converges on both sides."
     title, remarks = config.title or "Observers", choice_headline(summary)
-    return Result(title, verdict, headline, (), remarks, summary["remarks"], _tables(config, summary))
+    return Result(title, verdict, headline, figures, remarks, summary["remarks"], _tables(config, summary))
 
 
 def observer_toml(summary: JsonObject) -> str | None:
@@ -109,6 +196,7 @@ def observer_toml(summary: JsonObject) -> str | None:
     lines = [
         f"# Observer chosen by 'jaxbl tune'{for_title(summary)}",
         f"# Objective: {summary['objective_metric']}, among {', '.join(summary['observers'])}.",
+        *(f"# {side}: {result['ratio']:.3g} times the error of the best kind there." for side, result in sides.items()),
         '# To use it, put include = "gains.toml" at the top of a study and leave its own [observer] out.',
         "",
     ]
@@ -145,24 +233,32 @@ def choice_headline(summary: JsonObject) -> Lines:
         line = f"{side}: {', '.join(kinds) or 'all kinds diverge, or are too slow'}"
         if counts and shared:
             line += f"; not told apart from the best: {', '.join(shared)}"
-        lost = dict.fromkeys(
-            kind for result in results for kind, numbers in result["kinds"].items() if numbers["ratio"] is None
-        )
+        lost = dict.fromkeys(kind for result in results for kind in _sort_kinds(result["kinds"])[1])
         lines.append(f"{line}; diverge somewhere, or are too slow: {', '.join(lost)}." if counts and lost else f"{line}.")
     return lines
 
 
 def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
-    """A table for each side: every kind at every point."""
-    tables, axes = [], summary["axes"] if len(summary["points"]) > 1 else []
-    head = [*(axis_label(config, path) for path in axes), "observer", error_label(summary), "worst run", "times the best",
-            "from", "to", "gains"]  # fmt: skip
-    for side in summary["points"][0]["sides"]:
-        rows = [
-            [*(point["values"][path] for path in axes), kind, *(numbers[key] for key in ("error", "worst", *_RATIO)),
-             ", ".join(f"{key} = {value:.4g}" for key, value in numbers["gains"].items())]
-            for point in summary["points"]
-            for kind, numbers in point["sides"][side]["kinds"].items()
-        ]  # fmt: skip
-        tables.append(ResultTable(f"{side}, {_where(summary)}", head, rows))
+    points, kinds = summary["points"], summary["observers"]
+    tables = []
+    if len(points) == 1:
+        for side, result in points[0]["sides"].items():
+            rows = [
+                [kind, *(numbers[key] for key in ("error", "worst", *_RATIO)),
+                 ", ".join(f"{key} = {value:.4g}" for key, value in numbers["gains"].items())]
+                for kind, numbers in result["kinds"].items()
+            ]  # fmt: skip
+            columns = ["observer", error_label(summary), "worst run", "times the best", "from", "to", "gains"]
+            tables.append(ResultTable(f"{side}, {_where(summary)}", columns, rows))
+        return tables
+    axes = summary["axes"]
+    for side in points[0]["sides"]:
+        rows = []
+        for point in points:
+            result = point["sides"][side]
+            ratios = ["–" if (numbers := result["kinds"][kind])["ratio"] is None else _ratio(numbers) for kind in kinds]
+            values, tied = (point["values"][path] for path in axes), ", ".join(result["not_told_apart"])
+            rows.append([*values, result["best"] or "none", tied, *ratios])
+        columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
+        tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
     return tables

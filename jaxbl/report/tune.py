@@ -198,7 +198,17 @@ def gains_toml(summary: JsonObject) -> str:
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.',
     ]
     for side, gains in summary["gains"].items():
-        lines += ["", f"[observer.{side}]", f"lambda = {gains['lambda']!r}", f"alpha = {gains['alpha']!r}"]
+        achieved = summary["achieved"][side]
+        lines += [
+            "",
+            f"# f+ = {summary['f_plus'][side]:.4g} rad/s^2. Reached, the worst of all runs: velocity error "
+            f"{achieved['velocity_rmse']:.3g} rad/s rms,",
+            f"# torque error {achieved['torque_rmse']:.3g} N m rms, converged after {achieved['convergence_time']:.3g} s; "
+            f"margins {achieved['margin_alpha']:.3g} (alpha), {achieved['margin_exact']:.3g} (exact).",
+            f"[observer.{side}]",
+            f"lambda = {gains['lambda']!r}",
+            f"alpha = {gains['alpha']!r}",
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -38,7 +38,7 @@ def keep_likely(monkeypatch):
         return kept.fitted.names, gone
 
     monkeypatch.setattr(choice, "weigh", weigh)
-    monkeypatch.setattr(choice.Choice, "_find_left", lambda *_: (0.1, []))
+    monkeypatch.setattr(choice.Choice, "_find_missing", lambda *_: (0.1, []))
     return keep
 
 

@@ -11,8 +11,8 @@ from test_page import Page
 
 from jaxbl.gains.tune import tune
 from jaxbl.report.drawing import save
-from jaxbl.report.observer_choice import choice_headline, draw as draw_choice
-from jaxbl.report.panels import Line
+from jaxbl.report.observer_choice import choice_headline, draw as draw_choice, short_names
+from jaxbl.report.panels import Line, Map
 from jaxbl.report.results import describe, draw, write_report
 
 # points differ in values of lanes alone
@@ -53,7 +53,8 @@ def test_report_holds_lines_numbers_and_figures(report_folder):
     assert (report_folder / "gains.toml").exists() == single
     page = Page((report_folder / "report.html").read_text(encoding="utf-8"))
     assert "a <b> choice" in page.text
-    assert {path.stem for path in (report_folder / "figures").iterdir()} == {"observers"}
+    names = {"observers"} if single else {"observers_motor"}
+    assert {path.stem for path in (report_folder / "figures").iterdir()} == names
     lines = (report_folder / "lines").read_text(encoding="utf-8").splitlines()
     assert all(line in page.text for line in lines)
     for line in summary["remarks"]:
@@ -92,32 +93,31 @@ def test_the_point_figure_has_a_dot_at_each_ratio(point_choice):
     assert drawing.name == "observers" and "rad/s" in drawing.caption
 
 
-def test_over_several_points_the_figure_has_the_range_of_each_kind(mapped_choice, tmp_path):
-    (drawing,) = draw(mapped_choice)
-    (panel,) = drawing.panels
-    dots, words = (next(line for line in parts_of(panel, Line) if line.marker == marker) for marker in ("o", " "))
-    results = [point["sides"]["motor"] for point in mapped_choice.summary["points"]]
-    ratios = {kind: [result["kinds"][kind]["ratio"] for result in results] for kind in KINDS}
-    for (_, kind), x, text in zip(panel.y.names, dots.x, words.texts, strict=True):
-        assert x == pytest.approx(np.median(ratios[kind]))
-        wins = sum(result["best"] == kind for result in results)
-        assert text == (f"best at {wins} of 6 points" if wins else "")
-    assert (np.diff(dots.x) >= 0.0).all() and "Of 6 points" in drawing.caption
-    save(drawing, tmp_path / "ranges.png")
+def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
+    (drawing,) = draw(mapped_choice, "observers_motor")
+    (line,) = parts_of(drawing.panels[0], Line)
+    short_kinds = short_names(KINDS)
+    cells = dict(zip(zip(line.x, line.y, strict=True), line.texts, strict=True))
+    assert len(cells) == 6
+    for point in mapped_choice.summary["points"]:
+        noise, resolution = point["values"].values()
+        side = point["sides"]["motor"]
+        # x is the last axis
+        text = cells[int(resolution > 0.0), [1e-6, 1e-5, 1e-4].index(noise)]
+        first, _, second = text.partition("\n")
+        assert first == short_kinds[side["best"]] + "=" * bool(side["not_told_apart"])
+        assert bool(second) == (side["best"] != "super_twisting")
+    save(drawing, tmp_path / "map.png")
 
 
-def test_kinds_that_diverge_are_last(mapped_choice):
-    choice = copy.deepcopy(mapped_choice)
-    sides = [point["sides"]["motor"] for point in choice.summary["points"]]
-    for side in sides:
-        side["kinds"]["kalman"]["ratio"] = None
-    sides[0]["kinds"]["luenberger"]["ratio"] = None
-    for side in sides:
-        side["best"] = "super_twisting"
-    (panel,) = draw_choice(choice)[0].panels
-    texts = {name: text for line in parts_of(panel, Line) for text, name in zip(line.texts, line.y, strict=False)}
-    assert [name for _, name in panel.y.names][-1] == "kalman" and texts[2] == "diverged, or too slow"
-    assert "diverges, or is too slow, at 1" in texts.values()
+def test_over_one_axis_the_map_has_one_row(mapped_choice, tmp_path):
+    line_choice = choose_observer(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
+    panels = [draw_choice(choice)[0].panels[0] for choice in (line_choice, mapped_choice)]
+    one, both = (parts_of(panel, Map)[0].values for panel in panels)
+    assert one.shape == (1, 3)
+    # the same points are in the map
+    np.testing.assert_array_equal(one[0], both[:, 0])
+    save(draw_choice(line_choice)[0], tmp_path / "map.png")
 
 
 def test_points_won_are_counted(mapped_choice):
@@ -125,3 +125,11 @@ def test_points_won_are_counted(mapped_choice):
     winners = [point["sides"]["motor"]["best"] for point in mapped_choice.summary["points"]]
     for kind in set(winners):
         assert f"{kind} is best at {winners.count(kind)} of 6 points" in line
+
+
+def test_short_names_are_different():
+    names = ["super_twisting", "differentiator_3", "differentiator_1", "dirty_derivative", "slow_tracker", "steady_twin"]
+    short_by_name = short_names(names)
+    assert short_by_name["super_twisting"] == "ST"
+    assert short_by_name["differentiator_3"] == "D3"
+    assert len(set(short_by_name.values())) == len(names)

@@ -27,6 +27,7 @@ ROW_GROUP = 1 << 17
 """Rows of a row group of the Parquet file."""
 _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
+_LIBRARIES = ("hyparquet.js", "hyparquet.LICENSE.txt", "uPlot.js", "uPlot.css", "uPlot.LICENSE.txt")
 _SCRIPTS = ("hyparquet", "uPlot", "shared", "chart", "common")
 
 
@@ -107,11 +108,11 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
     loaded = "\n".join(f'<script src="{name}.js"></script>' for name in [*_SCRIPTS, *parts, "data"])
     page = page.replace("{parts}", elements).replace("{scripts}", loaded)
     (out / "index.html").write_text(page, encoding="utf-8")
-    copied = [*report.joinpath("vendored").iterdir(), *folder.iterdir()]
+    copied = [report.joinpath("vendored", name) for name in _LIBRARIES]
     copied += [report.joinpath(name) for name in ("page.css", "shared.js", "chart.js")]
+    copied += [folder.joinpath(name) for name in ("explore.css", "common.js", *(f"{part}.js" for part in parts))]
     for original in copied:
-        if original.name.endswith((".js", ".css", ".txt")):
-            (out / original.name).write_bytes(original.read_bytes())
+        (out / original.name).write_bytes(original.read_bytes())
 
 
 def colours_of(name: str) -> list[str]:
