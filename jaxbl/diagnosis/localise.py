@@ -9,10 +9,11 @@ finding. How much of the power a function of one coordinate explains is counted 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import jax
 import numpy as np
+from scipy.ndimage import median_filter
+from scipy.signal import find_peaks, periodogram
 
 from jaxbl.chain import Experiment
 from jaxbl.estimation.regression import Kinematics, balance
@@ -21,7 +22,7 @@ from jaxbl.fused.compilation import jit
 from jaxbl.records.least_squares import as_normal, rms
 
 from .coordinates import CoordinateValues
-from .residuals import Residual, SideResiduals, narrow, noise_spectrum
+from .residuals import Residual, SideResiduals, mean_density, narrow
 from .thresholds import LIMITS
 
 _BINS = 24
@@ -44,8 +45,10 @@ _SHORTEST, _IN_A_BIN = 20.0, 10.0
 """Cycles at the low-pass in a part at least; independent values in a bin."""
 _LOUD = 10.0
 """Power over the noise's from which on no narrower low-pass is tried."""
-_PEAKS, _NARROW, _AROUND = 5, 10.0, 20
-"""Peaks at most; power of one over the median of its neighbours; neighbours on each side."""
+_PEAKS, _NARROW, _AROUND = 5, 10.0, 41
+"""Peaks at most; power of one over the median around it; frequencies of that median."""
+_WAVES = 4096
+"""Frequencies that the noise of a mean over some time is summed over."""
 _SLOWEST, _MOVED = 3, 0.2
 """First frequency of a spectrum that may be a peak; share of a peak that the motion has there, too, if it is its own."""
 _LEAST_WEIGHT = 3.0
@@ -145,59 +148,44 @@ class Localised:
 
 
 class _Joined:
-    """Residuals of all parts, one after the other, and what their noise does to sums."""
+    """Residuals of all parts, one after the other, and blocks of time."""
 
     def __init__(self, residuals: Sequence[Residual]):
         self.parts = residuals
         self.torque = np.concatenate([residual.torque for residual in residuals])
         self.deviation = np.concatenate([residual.deviation for residual in residuals])
-        ends = np.cumsum([0, *(len(residual.time) for residual in residuals)])
-        self.slices = [slice(a, b) for a, b in itertools.pairwise(ends)]
-        self.count = int(ends[-1])
-        self.power, self.noise = float(np.sum(self.torque**2)), float(np.sum(self.deviation**2))
-        self.sizes = [2 ** int(np.ceil(np.log2(2 * len(residual.time)))) for residual in residuals]
-        self.spectra = [
-            [noise_spectrum(residual.correlation**power, size) for residual, size in zip(residuals, self.sizes, strict=True)]
-            for power in (1, 2)
-        ]
+        self.count, self.power, self.noise = len(self.torque), np.sum(self.torque**2), np.sum(self.deviation**2)
         # samples that count in a power: correlated ones count once
-        widths = [2.0 * np.sum(residual.correlation**2) - 1.0 for residual in residuals]
-        self.effective = sum(len(residual.time) / max(width, 1.0) for residual, width in zip(residuals, widths, strict=True))
-        total = sum(residual.time[-1] - residual.time[0] for residual in residuals)
-        slowest = max(width * residual.period for residual, width in zip(residuals, widths, strict=True))
-        length = max(total / _BLOCKS, 4.0 * slowest)
-        self.block = np.empty(self.count, int)
-        begun = 0
-        for residual, rows in zip(residuals, self.slices, strict=True):
-            span = residual.time[-1] - residual.time[0]
-            number = max(round(span / length), 1)
-            along = (residual.time - residual.time[0]) / max(span, np.finfo(float).tiny)
-            self.block[rows] = begun + np.minimum((along * number).astype(int), number - 1)
-            begun += number
-        self.blocks = begun
+        widths = [mean_density(part.density**2) / mean_density(part.density) ** 2 for part in residuals]
+        self.effective = sum(len(part.time) / width for part, width in zip(residuals, widths, strict=True))
+        slowest = max(width * part.period for part, width in zip(residuals, widths, strict=True))
+        length = max(sum(_span(part) for part in residuals) / _BLOCKS, 4.0 * slowest)
+        blocks = [_divide(part, max(round(_span(part) / length), 1)) for part in residuals]
+        begun = np.cumsum([0, *(part[-1] + 1 for part in blocks)])
+        self.block, self.blocks = np.concatenate([begun[i] + part for i, part in enumerate(blocks)]), int(begun[-1])
 
-    @cached_property
+    @property
     def z(self) -> float:
         """Significance of all power beyond the noise's."""
-        return float(_excess_z(self.power, self.noise, self.variance(np.ones((1, self.count)), 2))[0])
+        return float(self.excess_z(np.ones((1, self.count)))[0])
 
-    def variance(self, masks: np.ndarray, power: int) -> np.ndarray:
-        """Variance by noise of sums of residuals (1), or of their squares (2), over each of some sets of samples."""
-        weights = self.deviation**power
-        total = np.zeros(len(masks))
-        for rows, size, spectrum in zip(self.slices, self.sizes, self.spectra[power - 1], strict=True):
-            square = np.abs(np.fft.rfft(masks[:, rows] * weights[rows], size)) ** 2
-            # the ends of a real signal's spectrum count once, all else twice
-            counted = 2.0 * (square @ spectrum) - square[:, 0] * spectrum[0] - square[:, -1] * spectrum[-1]
-            total += counted / size
-        return power * total
+    def excess_z(self, masks: np.ndarray) -> np.ndarray:
+        """Significance of power beyond the noise's in each of some sets of samples (Wilson and Hilferty)."""
+        # of a set without samples nothing is used
+        noise = np.where(masks.any(axis=1), masks @ self.deviation**2, 1.0)
+        variance = 2.0 * (masks @ self.deviation**4) * self.count / self.effective
+        small = (variance / noise**2 + (2.0 * _LEVEL_UNKNOWN) ** 2) / 9.0
+        return (np.cbrt(masks @ self.torque**2 / noise) - (1.0 - small)) / np.sqrt(small)
 
 
-def _excess_z(power: np.ndarray | float, noise: np.ndarray | float, variance: np.ndarray | float) -> np.ndarray:
-    """Significance of sums of squares beyond the noise's, whose variance is given (Wilson and Hilferty)."""
-    noise = np.where(noise > 0.0, noise, 1.0)
-    small = (variance / noise**2 + (2.0 * _LEVEL_UNKNOWN) ** 2) / 9.0
-    return (np.cbrt(power / noise) - (1.0 - small)) / np.sqrt(small)
+def _span(residual: Residual) -> float:
+    return residual.time[-1] - residual.time[0]
+
+
+def _divide(residual: Residual, count: int) -> np.ndarray:
+    """Number of the piece of time of each sample, of so many that are as long."""
+    along = (residual.time - residual.time[0]) / max(_span(residual), np.finfo(float).tiny)
+    return np.minimum((along * count).astype(int), count - 1)
 
 
 def locate(
@@ -238,7 +226,7 @@ def locate(
     over = {name: _over_coordinate(name, values_of, joined, excess) for name, values_of in values.items()}
     longest = int(np.argmax([len(residual.time) for residual in residuals]))
     motion = coordinates[longest]["speed"].values if "speed" in names else None
-    peaks = _find_peaks(residuals[longest], motion, joined.parts[longest])
+    peaks = _find_peaks(residuals[longest], motion, float(np.sqrt(excess / joined.count)))
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
     beyond = (z > LIMITS.significant and missing > floor) or any(
         (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
@@ -275,38 +263,37 @@ def _over_coordinate(name: str, values_of: CoordinateValues, joined: _Joined, ex
     )
     masks = (index[None, :] == np.arange(count)[:, None]).astype(float)
     number = np.maximum(masks.sum(axis=1), 1.0)
-    power, noise = masks @ joined.torque**2, masks @ joined.deviation**2
-    z = _excess_z(power, noise, joined.variance(masks, 2))
     mean = (masks @ joined.torque) / number
-    error, mean_z = _mean_error(joined, index, count, mean, number, np.sqrt(joined.variance(masks, 1)) / number, name)
+    error, mean_z = _mean_error(joined, index, count, mean, number, name)
+    z, beyond = joined.excess_z(masks), masks @ (joined.torque**2 - joined.deviation**2)
     labels = values_of.classes or ("",) * count
     ends = [(None, None)] * count if edges is None else list(itertools.pairwise(edges.tolist()))
-    beyond = power - noise
     numbers = np.stack([number / joined.count, beyond / excess, beyond / number, z, mean, error, mean_z], axis=1).tolist()
     regions = tuple(Region(labels[i], *ends[i], *numbers[i]) for i in range(count) if masks[i].any())
     return Coordinate(name, values_of.unit, values_of.symbol, regions, _explained_share(name, values_of, joined, excess))
 
 
 def _mean_error(
-    joined: _Joined, index: np.ndarray, count: int, mean: np.ndarray, number: np.ndarray, by_noise: np.ndarray, name: str
+    joined: _Joined, index: np.ndarray, count: int, mean: np.ndarray, number: np.ndarray, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors of the means over bins, and how many of them each mean is away from zero."""
+    """Standard errors of the means over bins, by the scatter of blocks, and how many of them each mean is away from zero."""
     if name == "time":
-        # each moment comes but once
-        return by_noise, mean / np.maximum(by_noise, np.finfo(float).tiny)
+        # each moment comes but once: by the noise that remains in a mean over so many samples
+        wave = np.linspace(1e-9, np.pi, _WAVES)
+        share = [np.sinc(0.5 * n * wave / np.pi) ** 2 / np.sinc(0.5 * wave / np.pi) ** 2 for n in number]
+        densities = np.mean([part.density_at(wave) / mean_density(part.density) for part in joined.parts], axis=0)
+        square = np.bincount(index, joined.deviation**2, minlength=count)[:count] / number
+        error = np.sqrt(square * [mean_density(densities * passed) for passed in share])
+        return error, mean / np.maximum(error, np.finfo(float).tiny)
     sums, numbers = _sums(joined.torque, joined.block, joined.blocks, index, count)
-    visits = np.sum(numbers > 0, axis=0)
     # blocks with few samples of a bin are no block of their own
     weight = np.sum(numbers, axis=0) ** 2 / np.maximum(np.sum(numbers.astype(float) ** 2, axis=0), 1.0)
     freedom = np.maximum(weight - 1.0, 0.5)
-    scatter = np.sum((sums - mean * numbers) ** 2, axis=0) * (freedom + 1.0) / freedom
-    by_scatter = np.sqrt(scatter) / number
-    square = np.bincount(index, joined.torque**2, minlength=count)[:count] / number
-    enough = (visits >= _LEAST_BLOCKS) & (weight >= _LEAST_WEIGHT)
-    by_scatter = np.where(enough, by_scatter, np.maximum(by_scatter, np.sqrt(square)))
-    error = np.maximum(np.maximum(by_noise, by_scatter), np.finfo(float).tiny)
-    t = mean / error
-    return error, np.where(by_noise >= by_scatter, t, as_normal(t, freedom))
+    scatter = np.sqrt(np.sum((sums - mean * numbers) ** 2, axis=0) * (freedom + 1.0) / freedom) / number
+    size = np.sqrt(np.bincount(index, joined.torque**2, minlength=count)[:count] / number)
+    enough = (np.sum(numbers > 0, axis=0) >= _LEAST_BLOCKS) & (weight >= _LEAST_WEIGHT)
+    error = np.maximum(np.where(enough, scatter, np.maximum(scatter, size)), np.finfo(float).tiny)
+    return error, as_normal(mean / error, freedom)
 
 
 def _sums(torque: np.ndarray, row: np.ndarray, rows: int, index: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
@@ -320,11 +307,7 @@ def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
     """To which fold each sample belongs; over time, whose moments do not come again, each bin is parted among the folds."""
     if name != "time":
         return joined.block % _FOLDS
-    fold = np.empty(joined.count, int)
-    for residual, rows in zip(joined.parts, joined.slices, strict=True):
-        along = (residual.time - residual.time[0]) / (residual.time[-1] - residual.time[0])
-        fold[rows] = (along * count * _FOLDS).astype(int) % _FOLDS
-    return fold
+    return np.concatenate([_divide(part, count * _FOLDS) for part in joined.parts]) % _FOLDS
 
 
 def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, excess: float) -> float:
@@ -346,59 +329,34 @@ def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, ex
     return min(best / excess, 1.0)
 
 
-def _find_peaks(residual: Residual, speed: np.ndarray | None, low: Residual) -> tuple[SpectralPeak, ...]:
-    """Find narrow peaks in the spectrum of a part; shares are of the power that its low-passed version shows."""
-    frequency, power, floor = residual_spectrum(residual)
-    count = len(residual.time)
+def _find_peaks(residual: Residual, speed: np.ndarray | None, missing: float) -> tuple[SpectralPeak, ...]:
+    """Find narrow peaks in the spectrum of a part; shares are of the square of the torque that is `missing`, N m."""
+    frequency, power = _spectrum(residual.torque, residual.period)
     audible = frequency <= 2.0 * residual.bandwidth
-    frequency, power, floor = frequency[audible], power[audible], np.maximum(floor[audible], 1e-12 * np.max(floor))
-    beyond = power - floor
-    total = float(np.sum(low.torque**2) - np.sum(low.deviation**2)) / len(low.time) * count
-    total = max(total, _LEVEL_UNKNOWN * float(np.sum(residual.deviation**2)))
-    motion = None
-    if speed is not None:
-        moving = speed - np.mean(speed)
-        motion = np.abs(np.fft.rfft(moving * np.hanning(count))) ** 2
-    peaks: list[SpectralPeak] = []
-    taken = np.arange(len(power)) < _SLOWEST
-    for peak in np.argsort(-power):
-        if len(peaks) == _PEAKS:
-            break
-        if taken[peak]:
-            continue
+    frequency, power = frequency[audible], power[audible]
+    density = residual.density_at(2.0 * np.pi * frequency * residual.period) / mean_density(residual.density)
+    floor = np.mean(residual.deviation**2) * density * 2.0 / len(residual.time)
+    floor = np.maximum(floor, 1e-12 * np.max(floor))
+    motion = np.zeros(len(power)) if speed is None else _spectrum(speed, residual.period)[1][audible]
+    # a line of noise is exponential: so many times its mean is the largest of all
+    z = np.sqrt(np.maximum(2.0 * (power / (1.1 * floor) - np.log(len(power))), 0.0))
+    stands_out = (z > LIMITS.significant) & (power > _NARROW * median_filter(power, _AROUND))
+    stands_out[:_SLOWEST] = False
+    peaks, _ = find_peaks(np.where(stands_out, power, 0.0), distance=3)
+    loudest = []
+    for peak in peaks[np.argsort(-power[peaks])][:_PEAKS]:
         near = slice(max(peak - 2, 0), peak + 3)
-        taken[near] = True
-        # a line of noise is exponential: so many times its mean is the largest of all
-        z = np.sqrt(max(2.0 * (power[peak] / (1.1 * floor[peak]) - np.log(len(power))), 0.0))
-        if z < LIMITS.significant or power[peak] < _NARROW * _around(power, peak):
-            continue
-        here = np.sum(np.maximum(beyond[near], 0.0))
-        share = here / max(total, here)
-        moved = motion is not None and bool(np.sum(motion[near]) / np.sum(motion) > _MOVED * share)
-        peaks.append(SpectralPeak(float(frequency[peak]), np.sqrt(2.0 * here / count), share, z, moved))
-    return tuple(peaks)
+        here = float(np.sum(np.maximum(power - floor, 0.0)[near]))
+        share = here / max(missing**2, here)
+        moved = bool(np.sum(motion[near]) > _MOVED * share * np.sum(motion)) if motion.any() else False
+        loudest.append(SpectralPeak(float(frequency[peak]), float(np.sqrt(2.0 * here)), share, float(z[peak]), moved))
+    return tuple(loudest)
 
 
-def _around(power: np.ndarray, peak: int) -> float:
-    low, high = max(peak - _AROUND, 0), min(peak + _AROUND + 1, len(power))
-    rows = np.r_[low : max(peak - 3, low), min(peak + 4, high) : high]
-    return float(np.median(power[rows])) if len(rows) else float("inf")
-
-
-def residual_spectrum(residual: Residual) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frequencies (Hz), power of a residual in each of them, and its noise's; the powers add up to the sum of squares."""
-    count = len(residual.time)
-    window = np.hanning(count)
-    window = window / rms(window)
-    frequency = np.fft.rfftfreq(count, residual.period)
-    once = np.full(len(frequency), 2.0)
-    once[0] = 1.0
-    power = once * np.abs(np.fft.rfft(residual.torque * window)) ** 2 / count
-    size = 2 ** int(np.ceil(np.log2(max(2 * len(residual.correlation), count))))
-    density = noise_spectrum(residual.correlation, size)
-    grid = np.linspace(0.0, 0.5 / residual.period, len(density))
-    floor = once * np.mean(residual.deviation**2) * np.interp(frequency, grid, density)
-    return frequency, power, floor
+def _spectrum(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies, Hz, and mean square of a signal about its mean in each of them."""
+    frequency, density = periodogram(values, 1.0 / period, "hann")
+    return frequency, density * (frequency[1] - frequency[0])
 
 
 def localise(

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from jaxbl.chain import Experiment, Signals, State, TracedArrays, initial_observer_state, initial_state, replay
 from jaxbl.estimation.regression import Kinematics
@@ -23,7 +23,7 @@ from jaxbl.estimation.segments import Segment
 from jaxbl.fused.compilation import jit
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.records.least_squares import rms
-from jaxbl.records.linear_filters import filter_forwards, parzen_window
+from jaxbl.records.linear_filters import filter_forwards
 
 from .neutral_effects import complete
 from .residuals import Residual, beyond_nominal, narrow
@@ -38,8 +38,9 @@ _STUCK = 0.9
 """Share of alpha: a mean control beyond is a switching term that does not switch."""
 _OFTEN = 0.1
 """Share of the time in which it does not switch from which on an observer counts as not converged."""
-_MEMORY = 60.0
-"""Time constants over which the observers' noise is correlated: what is slow is a small rest of what is fast."""
+_MEMORY = 20.0
+"""Time constants over which the observers' noise is correlated. No more, so that what is slow has a share of what is fast:
+the error of the smoothed motion, which is slow, is in all draws alike."""
 
 
 class Observed(NamedTuple):
@@ -142,15 +143,13 @@ def _observe_side(experiment: Experiment, side: str, part: Kinematics, controls:
     # the mean takes its share of each
     noise = np.sqrt(_DRAWS / (_DRAWS - 1.0)) * (torque[1:] - np.mean(torque[1:], axis=0))
     count = noise.shape[1]
-    lags = min(max(math.ceil(_MEMORY / share), 10 * _LEAST_SKIPPED), count)
-    size = 2 ** math.ceil(math.log2(2 * count))
-    products = np.fft.irfft(np.mean(np.abs(np.fft.rfft(noise, size)) ** 2, axis=0))[:lags] / count
-    least = np.finfo(float).tiny
-    deviation = float(np.sqrt(np.maximum(np.mean(noise**2), least)))
-    # a window that keeps the spectrum positive, and what is fast out of what is slow
-    correlation = products / np.maximum(products[0], least) * parzen_window(lags)
+    deviation = float(np.sqrt(np.maximum(np.mean(noise**2), np.finfo(float).tiny)))
+    lags = min(_MEMORY / share, count)
+    power = np.mean(np.abs(np.fft.rfft(noise)) ** 2, axis=0)
+    # as wide as the spectrum of Parzen's window
+    density = gaussian_filter1d(power, np.sqrt(12.0) / (2.0 * np.pi) * count / lags)
     residual = Residual(
-        side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), correlation,
+        side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), density,
         min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
     )  # fmt: skip
     width = max(math.ceil(5.0 / share), _LEAST_SKIPPED)

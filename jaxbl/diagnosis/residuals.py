@@ -27,8 +27,8 @@ from jaxbl.estimation.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smo
 from jaxbl.fused.compilation import jit
 from jaxbl.records.signal_quality import estimate_white_noise
 
-_REACH = 60.0
-"""Length of the noise's correlation, over 1 / w_c: what is slow is a small rest of what is fast, and needs all of it."""
+_OPEN, _FREQUENCIES = 6.0, 1024
+"""Frequency, over one standard deviation of a Gaussian low-pass, beyond which nothing passes it; those it is looked at."""
 _LARGEST = 2**18
 """Frequencies of a response at most, which bounds memory."""
 
@@ -42,7 +42,7 @@ class Residual:
         time: s, shape (samples,).
         torque: missing torque behind the low-pass, N m; positive where it drives forward.
         deviation: standard deviation of its noise, N m.
-        correlation: of the noise, from lag 0 on; zero beyond.
+        density: of the noise's power over frequencies from 0 to half the sampling rate, evenly, in any unit.
         bandwidth: of the low-pass, Hz: faster torques are not seen.
     """
 
@@ -50,13 +50,17 @@ class Residual:
     time: np.ndarray
     torque: np.ndarray
     deviation: np.ndarray
-    correlation: np.ndarray
+    density: np.ndarray
     bandwidth: float
 
     @property
     def period(self) -> float:
         """Sampling period, s."""
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+
+    def density_at(self, frequency: np.ndarray) -> np.ndarray:
+        """Density of the noise at frequencies in rad per sample."""
+        return np.interp(frequency, np.linspace(0.0, np.pi, len(self.density)), self.density)
 
 
 SideResiduals = dict[str, list[Residual]]
@@ -97,7 +101,7 @@ def _corner(smoothness: float) -> float:
     return min(smoothness ** (1.0 / 6.0), np.pi)
 
 
-def _mean(spectrum: np.ndarray) -> float:
+def mean_density(spectrum: np.ndarray) -> float:
     """Variance of a real signal with a spectral density given from 0 to half the sampling rate."""
     return float(np.trapezoid(spectrum) / (len(spectrum) - 1))
 
@@ -230,14 +234,9 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
             missing = equation.taken - as_smoothed(equation.modelled, segment.smoothed[side], segment.period)
             level = abs(float(experiment.drive.torque_gain(side))) * sensor
             variance, spectrum = _noise(segment, side, slopes, float(equation.inertia), level, responses)
-            lags = min(int(_REACH / min(response.corner for response in responses.values())) + 2, len(segment))
-            correlation, tiny = np.fft.irfft(spectrum)[:lags], np.finfo(float).tiny
-            pieces.append(
-                Residual(
-                    side, segment.time, missing, np.sqrt(np.maximum(variance, tiny)),
-                    correlation / max(correlation[0], tiny), responses[side].corner / (2.0 * np.pi * segment.period),
-                )
-            )  # fmt: skip
+            deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+            bandwidth = responses[side].corner / (2.0 * np.pi * segment.period)
+            pieces.append(Residual(side, segment.time, missing, deviation, spectrum, bandwidth))
     return residuals
 
 
@@ -267,7 +266,7 @@ def _noise(
     low_pass, corner = responses[side].low_pass, responses[side].corner
     # white noise of the sensor
     spectrum = low_pass**2 * sensor**2
-    variance = np.full(len(segment), _mean(spectrum))
+    variance = np.full(len(segment), mean_density(spectrum))
     for name, smoothed in segment.smoothed.items():
         if name != side and not any(np.any(slope[name]) for slope in slopes):
             continue
@@ -278,16 +277,20 @@ def _noise(
         # noise lasts about as long as the low-pass does
         by_position, by_velocity = (gaussian_filter1d(np.asarray(slope[name]), 1.0 / corner) for slope in slopes)
         for order, slope in enumerate((by_position, by_velocity)):
-            passed = _mean(np.abs(low_pass * gain[order]) ** 2)
-            share = passed / _mean(np.abs(gain[order]) ** 2)
+            passed = mean_density(np.abs(low_pass * gain[order]) ** 2)
+            share = passed / mean_density(np.abs(gain[order]) ** 2)
             variance = variance + slope**2 * share * variances[order]
             # a slope that comes and goes spreads the noise over all frequencies
-            shape = low_pass**2 * passed / _mean(low_pass**2)
+            shape = low_pass**2 * passed / mean_density(low_pass**2)
             spectrum = spectrum + np.mean(slope) ** 2 * np.abs(low_pass * gain[order]) ** 2 + np.var(slope) * shape
         if name == side:
             accelerating = inertia**2 * np.abs(gain[2]) ** 2
             cross = -2.0 * inertia * (low_pass * gain[0] * gain[2].conj()).real
-            variance = variance + near[2] * _mean(accelerating) + np.sqrt(near[0] * near[2]) * by_position * _mean(cross)
+            variance = (
+                variance
+                + near[2] * mean_density(accelerating)
+                + np.sqrt(near[0] * near[2]) * by_position * mean_density(cross)
+            )
             spectrum = spectrum + accelerating + np.mean(by_position) * cross
     return variance, spectrum
 
@@ -299,19 +302,18 @@ def narrow(residual: Residual, cutoff: float) -> tuple[Residual, np.ndarray]:
     `cutoff` (Hz) half of the power passes.
     """
     width, stride, indices = _filter(residual, cutoff)
-    reach = len(residual.correlation) + int(8.0 * width)
-    size = 2 ** int(np.ceil(np.log2(2 * reach)))
-    spectrum = noise_spectrum(residual.correlation, size)
-    impulse = np.zeros(size)
-    impulse[size // 2] = 1.0
-    passed = np.fft.irfft(spectrum * np.abs(np.fft.rfft(gaussian_filter1d(impulse, width))) ** 2)
-    share = max(passed[0], np.finfo(float).tiny)
+    # up to where a Gaussian that is sampled lets nothing through
+    top, tiny = min(np.pi, _OPEN / width), np.finfo(float).tiny
+    frequency, sampled = (np.linspace(0.0, end, _FREQUENCIES) for end in (top, np.pi / stride))
+    response = np.exp(-0.5 * (width * (frequency[:, None] + 2.0 * np.pi * np.arange(-2, 3))) ** 2).sum(axis=1)
+    passed = residual.density_at(frequency) * (response / response[0]) ** 2
+    share = max(top / np.pi * mean_density(passed) / max(mean_density(residual.density), tiny), tiny)
     low = replace(
         residual,
         time=residual.time[indices],
         torque=gaussian_filter1d(residual.torque, width)[indices],
         deviation=np.sqrt(share * gaussian_filter1d(residual.deviation**2, width)[indices]),
-        correlation=passed[:reach:stride] / share,
+        density=np.interp(sampled, frequency, passed, right=0.0),
         bandwidth=min(cutoff, residual.bandwidth),
     )
     return low, indices
@@ -330,12 +332,3 @@ def low_passed(values: np.ndarray, residual: Residual, cutoff: float) -> np.ndar
     """Signals along a residual behind the low-pass of :func:`narrow`; shape (..., samples)."""
     width, _, indices = _filter(residual, cutoff)
     return gaussian_filter1d(values, width, axis=-1)[..., indices]
-
-
-def noise_spectrum(correlation: np.ndarray, size: int) -> np.ndarray:
-    """Spectral density over the variance, from 0 to half the sampling rate, of noise with a correlation from lag 0 on."""
-    symmetric = np.zeros(size)
-    lags = min(len(correlation), size // 2)
-    symmetric[:lags] = correlation[:lags]
-    symmetric[size - lags + 1 :] = correlation[lags - 1 : 0 : -1]
-    return np.maximum(np.fft.rfft(symmetric).real, 0.0)

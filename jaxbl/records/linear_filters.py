@@ -1,4 +1,4 @@
-"""Filters and spectra. `scipy.signal` is imported where it is used: a command that reads no log need not wait for it.
+"""Filters. `scipy.signal` is imported where it is used: a command that reads no log need not wait for it.
 
 Reference: A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data, Anal. Chem. 36 (1964).
 """
@@ -30,10 +30,3 @@ def savitzky_golay_slopes(values: np.ndarray, half_width: int) -> np.ndarray:
 
     # a cubic's slope does not change with a constant, which would cost digits
     return np.asarray(savgol_filter(values - values[0], 2 * half_width + 1, 3, deriv=1, mode="nearest"))
-
-
-def parzen_window(count: int) -> np.ndarray:
-    """Return Parzen's window for lags 0 to `count` - 1; its spectrum is positive."""
-    from scipy.signal.windows import parzen
-
-    return np.asarray(parzen(2 * count - 1))[count - 1 :]

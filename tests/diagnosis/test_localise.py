@@ -53,8 +53,8 @@ def draw_noise(seed, pole=0.0):
 
 
 def make_residual(torque, pole=0.0, level=0.1):
-    correlation = pole ** np.arange(120.0) if pole else np.ones(1)
-    return Residual("motor", TIME, torque, np.full(COUNT, level), correlation, 0.5 / PERIOD)
+    density = (1.0 - pole**2) / np.abs(1.0 - pole * np.exp(1j * np.linspace(0.0, np.pi, 1025))) ** 2
+    return Residual("motor", TIME, torque, np.full(COUNT, level), density, 0.5 / PERIOD)
 
 
 def locate_torque(torque, seed=0, pole=0.0, **further_coordinates):

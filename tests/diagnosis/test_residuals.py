@@ -7,7 +7,7 @@ from small_study import rigid_study, small_study
 from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
-from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrow, noise_spectrum, residual_torques
+from jaxbl.diagnosis.residuals import Residual, as_smoothed, narrow, residual_torques
 from jaxbl.estimation.regression import balance
 
 SETTINGS = {"run.duration": 4.0, "run.substeps": 5}
@@ -86,7 +86,7 @@ def test_narrowing_keeps_the_noise_level_and_what_is_slow():
     random = np.random.default_rng(2)
     time = 1e-3 * np.arange(20000)
     slow = np.sin(2.0 * np.pi * 0.7 * time)
-    white = Residual("motor", time, slow + random.standard_normal(20000), np.ones(20000), np.ones(1), 500.0)
+    white = Residual("motor", time, slow + random.standard_normal(20000), np.ones(20000), np.ones(2), 500.0)
     low, rows = narrow(white, 5.0)
     assert len(low.time) < 2000 and low.bandwidth == 5.0
     np.testing.assert_array_equal(low.time, time[rows])
@@ -96,9 +96,10 @@ def test_narrowing_keeps_the_noise_level_and_what_is_slow():
     assert narrowed_twice.deviation[50] == pytest.approx(narrowed_once.deviation[50], rel=0.1)
 
 
-def test_noise_spectrum_is_the_transform_of_the_correlation():
-    correlation = 0.8 ** np.arange(60)
-    spectrum = noise_spectrum(correlation, 512)
-    frequency = np.linspace(0.0, np.pi, 257)
-    expected = (1.0 - 0.64) / (1.0 + 0.64 - 1.6 * np.cos(frequency))
-    np.testing.assert_allclose(spectrum, expected, rtol=1e-3)
+def test_narrowing_tells_the_noise_that_remains_of_noise_that_grows_with_the_frequency():
+    noise = np.diff(np.random.default_rng(3).standard_normal(20002), n=2)
+    density = (2.0 * np.sin(0.5 * np.linspace(0.0, np.pi, 513))) ** 4
+    blue = Residual("motor", 1e-3 * np.arange(20000), noise, np.full(20000, np.sqrt(6.0)), density, 500.0)
+    for cutoff in (200.0, 50.0, 20.0):
+        low, _ = narrow(blue, cutoff)
+        assert rms(low.torque / low.deviation) == pytest.approx(1.0, abs=0.1)

@@ -1,10 +1,10 @@
-"""Filters and spectra beside those of SciPy."""
+"""Filters beside those of SciPy."""
 
 import numpy as np
 import pytest
 from scipy import signal
 
-from jaxbl.records.linear_filters import filter_forwards, parzen_window, savitzky_golay_slopes
+from jaxbl.records.linear_filters import filter_forwards, savitzky_golay_slopes
 
 RANDOM = np.random.default_rng(0)
 WALK = np.cumsum(RANDOM.standard_normal((3001, 2)), axis=0)
@@ -14,10 +14,6 @@ def test_one_way_begins_as_if_the_first_value_had_lasted():
     expected, _ = signal.lfilter([0.1], [1.0, -0.9], WALK, axis=0, zi=0.9 * WALK[:1])
     assert filter_forwards(WALK, [0.1], [-0.9]) == pytest.approx(expected, rel=1e-12, abs=1e-12)
     assert filter_forwards(np.full(7, 3.0), [0.1], [-0.9]) == pytest.approx(3.0, abs=0.0)
-
-
-def test_windows_are_those_of_scipy():
-    assert parzen_window(40) == pytest.approx(signal.windows.parzen(79)[39:], rel=1e-12)
 
 
 @pytest.mark.parametrize("half", [2, 20, 201])

@@ -230,7 +230,7 @@ def test_missing_torque_is_drawn_before_and_after(tmp_path):
     noise = 0.02 * np.random.default_rng(0).standard_normal(2000)
 
     def make_residual(torque, rows):
-        return Residual("motor", time[rows], torque[rows], np.full(len(time[rows]), 0.02), np.ones(1), 100.0)
+        return Residual("motor", time[rows], torque[rows], np.full(len(time[rows]), 0.02), np.ones(2), 100.0)
 
     before = 0.3 * np.sign(np.sin(5.0 * time)) + noise
     parts = [(slice(0, 1500), False), (slice(1500, 2000), True)]

@@ -14,7 +14,7 @@ from jaxbl.report.residuals import draw_residual
 def make_residual(name, torque, time):
     noise = 0.05 * np.random.default_rng(0).standard_normal(len(time))
     count = len(time)
-    residual = Residual(name, time, torque + noise, np.full(count, 0.05), np.ones(1), 100.0)
+    residual = Residual(name, time, torque + noise, np.full(count, 0.05), np.ones(2), 100.0)
     values = {
         "direction": CoordinateValues((np.cos(time) > 0.0).astype(int), classes=("backward", "forward")),
         "speed": CoordinateValues(3.0 * np.cos(time), "rad/s", symbol="ω"),
