@@ -190,11 +190,11 @@ def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:
         if phase is not None:
             sine, cosine = values
             return {cls.sizes()[0]: math.hypot(sine, cosine)} | fixed | {phase: math.atan2(cosine, sine)}
-        numbers = dict.fromkeys(cls.sizes(), 0.0)
+        numbers = dict.fromkeys(cls.sizes(), 0.0) | fixed
         for value, direction in zip(values, directions, strict=True):
             for leaf, share in direction.items():
                 numbers[leaf] += value * share
-        return numbers | fixed if cls.possible(numbers) else None
+        return numbers if cls.possible(numbers) else None
 
     return Candidate(name, len(effects), tuple(effects), columns, numbers_of, spread=ZERO_SPREAD if cls.in_log else 0.0)
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -298,13 +299,19 @@ def _inspect_or_mend(path: str | Path, table: _Table, guesses: list[str] | None)
         gearing, channel = inspection.record.statistics.gearing, inspection.log.position_source("theta_s")[0]
         if guesses is None or gearing is None or gearing.ratio > 0.0 or "sign" in table.get(channel, {"sign"}):
             return inspection
-        reason, key, value = f"{channel} counts against theta_e", "sign", "-1"
+        reason, key, value, assumed = f"{channel} counts against theta_e", "sign", "-1", ""
     except InputError as error:
-        remedy = re.search(r": (.+)[;:] set (\w+) = (-?[\d.e+]+) in \[log\] (\w+)(?! or)", str(error))
-        if guesses is None or remedy is None or remedy[2] in table.get(remedy[4], {remedy[2]}):
+        remedy = re.search(r': (.+)[;:] set (\w+) = ("\w+"|-?[\d.e+]+) in \[log\] (\w+)(?! or)', str(error))
+        if guesses is None or remedy is None:
             raise
         reason, key, value, channel = remedy.groups()
-    table[channel][key] = int(value) if value.lstrip("-").isdecimal() else float(value)
+        # a unit that is assumed may be another one
+        start = f"The unit of '{table.get(channel, {}).get('column')}' is not given: "
+        assumed = next((guess for guess in guesses if key == "unit" and guess.startswith(start)), "")
+        if key in table.get(channel, {key}) and not assumed:
+            raise
+    table[channel][key] = tomllib.loads(f"value = {value}")["value"]
+    guesses[:] = [guess for guess in guesses if guess != assumed]
     guesses.append(f"{channel}.{key} = {value}: {reason}.")
     return None
 

@@ -12,8 +12,9 @@ from .rigid_body import fit_rigid_drive
 _Signals = Mapping[ColumnName, np.ndarray]
 _SAME, _GEARED = 0.9, 0.99
 """Correlation from which on columns show one motion, before and behind a controller, or a gear."""
-_SAME_SIZE = 0.1
-"""Relative difference in size up to which one of two alike is the other's reference; more is a gear."""
+_SAME_SIZE = 0.25
+"""Relative difference in size up to which one of two alike is the other's reference, which it may overshoot or cut short;
+more is a gear."""
 _LATE = 1e-6
 """Slope of the correlation of two columns at no shift, a row, from which on one is later: rounding aside."""
 _SPEED = 0.95

@@ -1,5 +1,7 @@
 """A first study for a log, from its columns and a rough fit."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -115,16 +117,25 @@ def write_unsigned_words(frame):
     return frame.assign(load=np.round(1e3 * frame["u"]).astype(int) % 65536).drop(columns="u")
 
 
+def write_degrees_without_unit(frame):
+    return frame.assign(theta_e=np.round(np.degrees(frame["theta_e"]) / 360.0 * 4096.0) * 360.0 / 4096.0)
+
+
 @pytest.mark.parametrize(
     ("write", "channel", "key", "value"),
-    [(wrap_position, "theta_e", "wrap", 360), (write_unsigned_words, "u", "signed_bits", 16)],
+    [
+        (wrap_position, "theta_e", "wrap", 360),
+        (write_unsigned_words, "u", "signed_bits", 16),
+        (write_degrees_without_unit, "theta_e", "unit", "deg"),
+    ],
 )
 def test_what_a_refusal_asks_for_is_taken(write, channel, key, value, tmp_path):
     """The remedy stands in the proposed table, with the reason, and the log is read by it."""
     write(simulate_log(count=8000).drop(columns="theta_s")).to_csv(tmp_path / "log.csv", index=False)
     study, guesses, _ = propose_study(tmp_path / "log.csv")
     assert study["log"][channel][key] == value
-    assert sum(guess.startswith(f"{channel}.{key} = {value}: column ") for guess in guesses) == 1
+    assert sum(guess.startswith(f"{channel}.{key} = {json.dumps(value)}: column ") for guess in guesses) == 1
+    assert not any("rad is assumed" in guess for guess in guesses) or key != "unit"
     read_model(study)
 
 

@@ -17,6 +17,8 @@ def test_what_follows_is_measured(lag, shape):
     signals = {"reference": reference, "measured": np.roll(reference, lag) + 1e-4 * np.cos(1e3 * np.arange(4000))}
     assert find_latest(signals) == find_latest(dict(reversed(signals.items()))) == "measured"
     assert find_latest({"motor": reference, "load": 0.5 * signals["measured"]}) == "motor"
+    # what overshoots its reference is measured all the same
+    assert find_latest({"commanded": reference, "measured": 1.2 * signals["measured"]}) == "measured"
 
 
 def test_stamps_rise_evenly_and_a_counter_is_none():

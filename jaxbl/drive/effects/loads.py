@@ -17,6 +17,9 @@ TRIAL_ARC = 3.0 * np.pi
 """Part of a wave that the motion must cover for its harmonic to be tried, rad: over less it does not repeat."""
 MAX_DAMPING_RATIO = 0.95
 """Damping ratio above which an inertia behind a spring hardly swings, so that its frequency has no meaning."""
+_LARGEST_DAMPING = 0.5
+"""Damping ratio below which a flexible part is named: rubber couplings reach 0.16 (relative damping 2, DIN 740-2), and from
+0.7 on nothing swings. What a fit takes to more is another loss: friction that bends, or slip."""
 
 
 def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
@@ -175,6 +178,10 @@ class Flexibility(SideEffect):
     damping_ratio: Scalar = shape(
         "", "damping ratio D", lambda log: [0.02, 0.1], default=0.02, above=0.0, maximum=MAX_DAMPING_RATIO
     )
+
+    @classmethod
+    def possible(cls, numbers):
+        return super().possible(numbers) and numbers["damping_ratio"] < _LARGEST_DAMPING
 
     @property
     def _rates(self):
