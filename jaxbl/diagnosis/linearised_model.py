@@ -648,7 +648,7 @@ def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float
     response = (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
     # a state without influence has a zero of its own among these
     least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest
-    return response, float(np.finfo(float).eps * gram[0, 0] * largest / max(least, 1e-300)) if largest > 0.0 else 0.0
+    return response, float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT)) if largest > 0.0 else 0.0
 
 
 def _without(gram: np.ndarray, states: int, response: np.ndarray) -> np.ndarray:

@@ -14,6 +14,8 @@ def as_normal(t: np.ndarray, freedom: np.ndarray | float) -> np.ndarray:
     return np.sign(t) * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0) * np.sqrt(freedom * np.log1p(t**2 / freedom))
 
 
+# of what diverges
+@np.errstate(over="ignore")
 def rms(values: np.ndarray) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
