@@ -63,8 +63,8 @@ _SETTINGS: Any = {
     "savefig.dpi": 150,
     "svg.fonttype": "path",
 }
-_NAME, _HALO = "#111111", "#fefefe"
-"""Of names that are written on lines."""
+_NAME, _HALO, _NAME_SIZE = "#111111", "#fefefe", 8.5
+"""Of names that are written along lines: colours, and size in points."""
 _INK = (
     (BLACK, "currentColor"), (_NAME, "currentColor"), ("#ffffff", "var(--paper)"), (_HALO, "var(--back)"),
     ("#dddddd", "var(--grid)"),
@@ -251,6 +251,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
         _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
+    _name_lines(ax, [part for part in panel.parts if isinstance(part, Line) and part.at_line])
     ax.grid(not any(isinstance(part, Map) for part in panel.parts))
     for name, axis in zip("xy", panel[:2], strict=True):
         drawn = getattr(ax, f"{name}axis")
@@ -294,22 +295,41 @@ def _draw_line(ax: Axes, line: Line, layer: float) -> None:
     beside: Any = {"va": "center", "xytext": (6, 0), "textcoords": "offset points"}
     for x, y, text in zip(line.x, line.y, line.texts):  # noqa: B905
         ax.annotate(_plain(text), (x, y), fontsize=8, zorder=6, **(beside if line.marker else centred))
-    if line.at_line:
-        _name_line(ax, line)
 
 
-def _name_line(ax: Axes, line: Line) -> None:
-    """Write a line's name on it, where it is inside of the axes and no other one's name is."""
-    (left, right), (low, high) = map(sorted, (ax.get_xlim(), ax.get_ylim()))
-    x, y = np.asarray(line.x), np.asarray(line.y)
-    inside = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
-    if len(inside):
-        # in the middle of the curve's width: beside it a name may stand on another one
-        i = inside[int(len(inside) * (0.45, 0.4, 0.6, 0.25, 0.5)[len(ax.texts) % 5])]
-        name = ax.text(
-            float(x[i]), float(y[i]), _plain(line.name), fontsize=8.5, ha="center", va="center", zorder=6, color=_NAME
-        )
-        name.set_path_effects([withStroke(linewidth=2.5, foreground=_HALO)])
+def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
+    """Write the names of lines along them, each where its line is farthest from the others."""
+    paths = [_follow(ax, line) for line in lines]
+    for line, path in zip(lines, paths, strict=True):
+        # half of its length, at 5 points a letter, on both sides of a place where the line is nearly straight
+        room = 2.5 * len(line.name) * ax.figure.dpi / 72.0
+        half = int(np.clip(room / max(np.hypot(*(path[1] - path[0])), 1e-9), 1, (len(path) - 1) // 2))
+        first, middle, last = path[: -2 * half], path[half:-half], path[2 * half :]
+        (left, low), (right, high), along = ax.bbox.min, ax.bbox.max - [0.0, 2.0 * _NAME_SIZE], last - first
+        fit = (middle > [left + room, low]).all(axis=1) & (middle < [right - room, high]).all(axis=1)
+        fit &= np.abs(along[:, 1]) < np.abs(along[:, 0])
+        others = np.concatenate([np.full((1, 2), np.inf), *(other for other in paths if other is not path)])
+        apart = np.hypot(*(middle[:, None] - others).transpose(2, 0, 1)).min(axis=1).clip(max=10.0 * _NAME_SIZE)
+        bent = np.hypot(*(middle - 0.5 * (first + last)).T)
+        if fit.any():
+            i = int(np.argmax(np.where(fit, apart - 4.0 * bent, -np.inf)))
+            turn = float(np.arctan2(along[i, 1], along[i, 0]))
+            name = ax.annotate(
+                _plain(line.name), ax.transData.inverted().transform(middle[i]), (-3.0 * np.sin(turn), 3.0 * np.cos(turn)),
+                textcoords="offset points", fontsize=_NAME_SIZE, ha="center", va="bottom", zorder=6, color=_NAME,
+                rotation=np.degrees(turn), rotation_mode="anchor",
+            )  # fmt: skip
+            name.set_path_effects([withStroke(linewidth=2.5, foreground=_HALO)])
+
+
+def _follow(ax: Axes, line: Line) -> np.ndarray:
+    """Places along a line in pixels, evenly, shape (places, 2); what is far outside of the axes is nearer."""
+    far = np.array([100.0, 100.0])
+    with np.errstate(all="ignore"):
+        path = ax.transData.transform(np.column_stack([line.x, line.y]))
+    path = np.clip(np.nan_to_num(path), ax.bbox.min - far, ax.bbox.max + far)
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    return np.stack([np.interp(np.linspace(0.0, way[-1], 301), way, places) for places in path.T], axis=1)
 
 
 def _draw_band(ax: Axes, band: Band, layer: float) -> None:
