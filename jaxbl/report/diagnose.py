@@ -61,14 +61,12 @@ _FAR = 10.0
 def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     """Errors of torque and position on held-out data, and the least certain effect with its first number."""
     gap, figures = summary["gap"], []
-    before, after, noise = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor"))
+    errors = _errors_of_channels(gap)
     for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
-        if there := [name for name in channels if name in before]:
-            name = max(there, key=lambda name: _ratio(before[name], noise[name]))
-            change = f"{rms_text(before[name])} → {rms_text(after[name])} {gap['units'][name]}"
-            figures.append(
-                KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (noise {rms_text(noise[name])})")
-            )
+        if there := [(name, *errors[name][:3]) for name in channels if name in errors]:
+            name, before, after, noise = max(there, key=lambda row: _ratio(row[1], row[3]))
+            change = f"{rms_text(before)} → {rms_text(after)} {gap['units'][name]}"
+            figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (noise {rms_text(noise)})"))
     if summary["findings"]:
         finding = min(summary["findings"], key=lambda finding: finding["confidence"])
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
@@ -244,12 +242,11 @@ def _failed_checks(summary: JsonObject) -> Lines:
 
 def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
     """Return of each channel the failed test that shows it best, its error and limit."""
-    tested = {name: (torque["after"], torque["limit"]) for name, torque in gap.get("slow_torques", {}).items()}
-    tested |= {name: (gap["holdout_rmse_after"][name], error["limit"]) for name, error in gap["expected"].items()}
-    best = dict[str, str]()
-    for name in sorted(gap["test"]["failed"], key=lambda name: _ratio(*tested[name]), reverse=True):
-        best.setdefault(name.split()[0], name)
-    return [(name, *tested[name]) for name in best.values()]
+    errors, best = _errors_of_channels(gap), dict[str, tuple[str, Any, Any]]()
+    tests = [(name, errors[name][1], errors[name][3]) for name in gap["test"]["failed"]]
+    for test in sorted(tests, key=lambda test: _ratio(*test[1:]), reverse=True):
+        best.setdefault(test[0].split()[0], test)
+    return [*best.values()]
 
 
 def probability(value: float) -> str:
@@ -294,16 +291,22 @@ def _history_table(summary: JsonObject) -> ResultTable:
     return ResultTable("How the name was found", head, rows)
 
 
-def _gap_table(gap: JsonObject) -> ResultTable:
-    units, limits = gap["units"], {name: error["limit"] for name, error in gap["expected"].items()}
-    rows: list[list[Any]] = [
-        [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], limits.get(name)]
+def _errors_of_channels(gap: JsonObject) -> dict[str, list[Any]]:
+    """Held-out error before and after, noise, and the limit of a complete model, of each channel, and of slow torques."""
+    expected = gap["expected"]
+    errors = {
+        name: [before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], expected.get(name, {}).get("limit")]
         for name, before in gap["holdout_rmse_before"].items()
-    ]
-    for name, torque in gap.get("slow_torques", {}).items():
-        channel, _, below = name.partition(" ")
-        numbers = (torque[key] for key in ("before", "after", "noise", "limit"))
-        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers])
+    }
+    slow = gap.get("slow_torques", {}).items()
+    return errors | {name: [torque[key] for key in ("before", "after", "noise", "limit")] for name, torque in slow}
+
+
+def _gap_table(gap: JsonObject) -> ResultTable:
+    rows = []
+    for name, numbers in _errors_of_channels(gap).items():
+        channel, *below = name.split(maxsplit=1)
+        rows.append([", ".join([_CHANNELS[channel], *below]), gap["units"][channel], *numbers])
     head = ["channel", "unit", "before", "after", "noise", "complete model at most"]
     return ResultTable("Held-out data, rms", head, rows)
 

@@ -4,7 +4,6 @@
 """
 
 import base64
-import itertools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -143,7 +142,7 @@ class Map(NamedTuple):
     y: Any
     values: Any
     scale: Scale
-    failed: Any = None
+    failed: Any = False
     name: str = ""
 
 
@@ -169,6 +168,11 @@ class Panel(NamedTuple):
     y: Axis
     parts: Sequence[Part]
     title: str = ""
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """Both axes, by letter."""
+        return {"x": self.x, "y": self.y}
 
 
 class Figure(NamedTuple):
@@ -199,12 +203,22 @@ def arrange(count: int) -> int:
 
 def join(axis: Any, parts: Iterable[slice], *signals: Any) -> list[Array]:
     """Values of an axis and of signals over it, part by part, with a NaN between parts where lines break."""
-    rows = list(parts)
-    break_ = np.full(1, np.nan)
-    # the place of a break does not matter, but lines are thinned along it
-    times = [[np.asarray(axis, float)[part], np.asarray(axis, float)[part][-1:]] for part in rows]
-    values = [[[np.asarray(signal, float)[part], break_] for part in rows] for signal in signals]
-    return [np.concatenate(list(itertools.chain(*pieces))) for pieces in (times, *values)]
+    # the place of a break does not matter, but lines are thinned along it: the last sample once more
+    samples = [np.r_[part, part.stop - 1] for part in parts]
+    columns = [np.asarray(values, float)[np.concatenate(samples)] for values in (axis, *signals)]
+    for column in columns[1:]:
+        column[np.cumsum([*map(len, samples)]) - 1] = np.nan
+    return columns
+
+
+def draw_signals(time: Any, segments: Iterable[slice], signals: Iterable[tuple[Any, str, str, str]]) -> list[Panel]:
+    """A panel over time for each signal: its values, label, unit and colour; lines break between segments."""
+    signals = list(signals)
+    time, *joined = join(time, segments, *(values for values, *_ in signals))
+    return [
+        Panel(TIME, Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
+        for values, (_, label, unit, colour) in zip(joined, signals, strict=True)
+    ]
 
 
 def intervals(
@@ -267,10 +281,10 @@ def envelope(low: Any, high: Any) -> list[Array]:
     size = -(-len(low) // (_LINE_POINTS // 2))
     rows = []
     for values, find, filler in ((low, np.argmin, np.inf), (high, np.argmax, -np.inf)):
-        padded = np.pad(np.asarray(values, float), (0, -len(values) % size), constant_values=np.nan).reshape(-1, size)
-        best = find(np.where(np.isnan(padded), filler, padded), axis=1)
-        # a break stays one
-        rows.append(np.minimum(np.arange(len(padded)) * size + best, len(values) - 1))
+        # the first of a bin that is a break, so that it stays one
+        there = np.where(np.isnan(values), filler, values)
+        bins = np.pad(there, (0, -len(values) % size), constant_values=filler).reshape(-1, size)
+        rows.append(np.arange(len(bins)) * size + find(bins, axis=1))
     return rows
 
 
@@ -361,7 +375,7 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         ends: of x and y, as they are drawn.
     """
     content: JsonObject = {"place": [round(number, 5) for number in place], "title": panel.title.replace("\n", ", ")}
-    for name, axis, drawn_ends in zip("xy", panel[:2], ends, strict=True):
+    for (name, axis), drawn_ends in zip(panel.axes.items(), ends, strict=True):
         content[name] = {
             "label": axis.label.replace("\n", " "), "key": axis.key, "log": axis.log,
             "ends": [float(f"{end:.8g}") for end in drawn_ends],
@@ -385,7 +399,7 @@ def describe_panel(panel: Panel, ends: Sequence[Pair]) -> str:
     head = f"{panel.title}: ".replace("\n", ", ") if panel.title else ""
     axes = [
         f"{name} {axis.label or 'without a name'} from {low:.3g} to {high:.3g}{' (logarithmic)' if axis.log else ''}"
-        for name, axis, (low, high) in zip("xy", panel[:2], ends, strict=True)
+        for (name, axis), (low, high) in zip(panel.axes.items(), ends, strict=True)
         if not axis.names
     ]
     names = [part.name for part in panel.parts if isinstance(part, Line) and part.name]

@@ -3,11 +3,9 @@
 Without refinement in its neighbourhood that is a point of the coarse grid: its block is one coarse cell, centred on it.
 """
 
-from itertools import starmap
-
 import numpy as np
 import pandas as pd
-from pandas import DataFrame, Series
+from pandas import DataFrame
 from scipy.spatial import KDTree
 
 from jaxbl.sweeps.points import Points
@@ -42,12 +40,12 @@ class Filling:
         # of two that are as near the upper one
         return KDTree(self._places(simulated)).query(self._places(asked) + 1e-6, p=np.inf, distance_upper_bound=0.50001)[1]
 
-    def dense(self, table: Series) -> tuple[Array, Array, Array]:
-        """Values of x `(columns,)` and y `(rows,)`, and a table over (y, x) on the whole plane `(rows, columns)`."""
-        y, x = starmap(_drawn_values, zip(self._values, self._cells, strict=True))
-        plane = pd.MultiIndex.from_product([y, x], names=self.paths).to_frame()
-        nearest = self._nearest(table.index.to_frame(), plane)
-        return x, y, np.append(table.to_numpy(float), np.nan)[nearest].reshape(len(y), len(x))
+    def fill(self, table: DataFrame) -> DataFrame:
+        """A table over (y, x) on the whole plane: rows of the nearest places, NaN where there is none."""
+        drawn_values = map(_drawn_values, self._values, self._cells)
+        plane = pd.MultiIndex.from_product(drawn_values, names=self.paths)
+        nearest = self._nearest(table.index.to_frame(), plane.to_frame())
+        return table.reset_index(drop=True).reindex(nearest).set_axis(plane)
 
     def complete(self, frame: DataFrame, paths: list[str]) -> DataFrame:
         """A frame in which each vertex that was simulated at any values of the other axes has rows at all of them.
@@ -72,11 +70,17 @@ def _drawn_values(values: Array, cell: int) -> Array:
     return values[::step]
 
 
+def coarse_axes(points: Points) -> dict[str, Array]:
+    """Values of the coarse grid along the refined axes, by path; none of a study that is not refined."""
+    if points.refinement is None:
+        return {}
+    stride = 1 << points.refinement.grid.depth
+    return {path: points.axis_values(path)[::stride] for path in points.refinement.paths}
+
+
 def on_coarse_values(points: Points, frame: DataFrame, drawn: list[str]) -> DataFrame:
     """The rows of a refined study whose values are on the coarse grid along all axes but those drawn."""
-    assert points.refinement is not None
-    stride = 1 << points.refinement.grid.depth
-    for path in points.refinement.paths:
+    for path, values in coarse_axes(points).items():
         if path not in drawn:
-            frame = frame.loc[np.isin(frame[path], points.axis_values(path)[::stride])]
+            frame = frame.loc[np.isin(frame[path], values)]
     return frame

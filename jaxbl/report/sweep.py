@@ -102,30 +102,27 @@ class _Survey:
         metrics = [name for name in metrics if name in result.columns]
         self.sides = [side for side in config.sides if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
-        points = Points(config) if config.sweep.refine is not None else None
+        points = Points(config)
         self.runs = self.even = self.diverged = 0
         self.converged = dict.fromkeys(self.sides, 0)
         self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
         for frame in result.batches([*paths, "seed", "finite", *metrics]):
-            even = frame if points is None else frame[points.on_coarse_grid(frame)]
+            even = frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
             self.diverged += int((~frame["finite"].astype(bool)).sum())
             for side in self.sides:
                 self.converged[side] += int(even[f"{side}.converged"].sum())
-        errors = {side: f"{side}.velocity_rmse" for side in config.sides}
-        ranked = {side: rank_axes(result, error) for side, error in errors.items() if error in metrics}
-        self.importance = {side: axes for side, axes in ranked.items() if axes}
-        for side in self.sides if config.sweep.design == "grid" else []:
-            gains = [
-                axis.path
-                for axis in config.axes
-                if axis.path.startswith(f"observer.{side}.") and values_of(config, axis) > 1
-            ]
-            if gains and f"{side}.velocity_rmse" in metrics:
+        self.importance: dict[str, list[AxisImportance]] = {}
+        varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
+        for side in config.sides:
+            error, gains = f"{side}.velocity_rmse", [path for path in varied if path.startswith(f"observer.{side}.")]
+            if error in metrics and (ranked := rank_axes(result, error)):
+                self.importance[side] = ranked
+            if error in metrics and side in self.sides and gains:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
                 groups = Groups(Rows(result, columns), gains, paths)
-                runs = worst_runs(groups, f"{side}.velocity_rmse", f"{side}.margin_alpha" in metrics)
+                runs = worst_runs(groups, error, f"{side}.margin_alpha" in metrics)
                 self.best[side] = best_gains(runs), runs
 
 

@@ -46,7 +46,7 @@ def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
     coarse = tuning.candidates[side].query("stage == 0")
-    tables = coarse.astype({"feasible": float, "converged": float}).pivot_table(
+    tables = coarse.astype({"feasible": float}).pivot_table(
         index="lambda",
         columns="alpha",
         values=["error", "feasible"],
@@ -139,17 +139,18 @@ def describe(tuning: Tuning) -> Result:
         verdict, headline = "doubtful", f"{headline} Little reserve until they fail or err twice as much: {', '.join(thin)}."
     if beaten := _better_gains(summary):
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
-    remarks = [*doubts_among(summary["remarks"]), *_reasons(summary)]
+    doubts = doubts_among(summary["remarks"])
+    remarks = [*doubts, *_reasons(summary), *certified]
     if is_refuted(summary):
         verdict, headline = "failed", "The search found an error above what was proven."
-    details = [line for line in summary["remarks"] if line not in remarks]
+        remarks = [*certified, *doubts, *_reasons(summary)]
+    details = [line for line in summary["remarks"] if line not in doubts]
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
         _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
     ]
     title = tuning.config.title or "Gains"
-    remarks = [*certified, *remarks] if is_refuted(summary) else [*remarks, *certified]
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
 
 

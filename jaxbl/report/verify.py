@@ -21,7 +21,7 @@ from .loop_gains import margin_table
 from .maps import cell_edges
 from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mark
 
-_USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
+_USUAL = {"name": "usual pair (1.5, 1.1)", "alpha_ratio": 1.1, "lambda_ratio": 1.5}
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 
 
@@ -32,12 +32,11 @@ def draw(verdict: Verdict) -> list[Figure]:
 
 def _mark_gains(verdict: Verdict) -> list[Line]:
     """Marks of the usual pair and of the study's marks."""
-    places = [_USUAL]
-    for gains in verdict.summary["marks"]:
-        if gains["alpha_ratio"] is not None:
-            places.append((literal(gains["name"]), gains["alpha_ratio"], gains["lambda_ratio"]))
-    pairs = zip(places, itertools.cycle(("*", *MARKERS)), strict=False)
-    return [mark(x, y, name, marker, 12.0) for (name, x, y), marker in pairs]
+    marks = [_USUAL, *(gains for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None)]
+    return [
+        mark(gains["alpha_ratio"], gains["lambda_ratio"], literal(gains["name"]), marker, 12.0)
+        for gains, marker in zip(marks, itertools.cycle(("*", *MARKERS)), strict=False)
+    ]
 
 
 def _atlas(verdict: Verdict) -> Figure:
@@ -71,8 +70,8 @@ def describe(verdict: Verdict) -> Result:
     """Say whether the study's own gains and the marked ones are safe, and which conditions are wrong."""
     marks, levels, own_gains = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
-    exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
-    failures = sum(entry["counterexamples"] for _, entry in exact)
+    exact = (entry for level in levels for entry in level["conditions"] if entry["name"] == "exact")
+    failures = sum(entry["counterexamples"] for entry in exact)
     extent = (
         f"{levels[0]['cells']} cells of the error system and {sum(level['cells'] for level in levels[1:])} runs of the drive"
     )
@@ -151,7 +150,8 @@ def _level_table(level: JsonObject) -> ResultTable:
 
 
 def _mark_table(marks: list[JsonObject]) -> ResultTable:
-    keys = {
+    columns = {
+        "name": "",
         "lambda": "λ",
         "alpha": "α",
         "f_plus": "true f⁺",
@@ -164,5 +164,5 @@ def _mark_table(marks: list[JsonObject]) -> ResultTable:
         "converged": "converged",
         "convergence_time": "after (s)",
     }
-    rows = [[gains["name"], *(gains[key] for key in keys)] for gains in marks]
-    return ResultTable("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
+    rows = [[gains[key] for key in columns] for gains in marks]
+    return ResultTable("Marked gains, run on the study's drive with ideal encoders", [*columns.values()], rows)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import tomli_w
 
@@ -117,12 +116,12 @@ def draw(watch: Watch) -> list[Figure]:
             ]
             parts.append(Span(limit, limit, "limit", along="y", width=1.2))
         for side in sides:
-            middle, error = (values[f"{side}.{name}{kind}"].to_numpy(float) for kind in ("", "_error"))
+            middle, error = (values[f"{side}.{name}{kind}"].astype(float) for kind in ("", "_error"))
             low, high = middle - INTERVAL * error, middle + INTERVAL * error
             who = f"by the {side}'s observer"
             parts += [Band(time, low, high, "", SIDE_COLOURS[side]), Line(time, middle, who, SIDE_COLOURS[side])]
             # what is hardly determined would set the scale of all else
-            sure = error <= 3.0 * np.nanmedian(error) if np.isfinite(error).any() else np.isfinite(error)
+            sure = error <= 3.0 * error.median()
             curves += [middle[sure], low[sure], high[sure]]
         lead = f"{sides[0]} " if len(sides) == 1 else ""
         y = Axis(f"{LABELS[name]}\n{lead}({task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))

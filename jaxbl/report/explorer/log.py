@@ -53,7 +53,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     """
     units = _units(summary)
     frame = trace.assign(**_turns(trace, units))
-    if _is_run(summary):
+    if "single_run" in summary:
         frame = frame.assign(**_errors(frame)).rename(columns={"z": "twist"})
     coordinates = list(_coordinates(frame, units))
     if "alarm_gap" in summary:
@@ -72,9 +72,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         write(frame)
     return {
         "rows": len(frame),
-        "period": summary.get("every")
-        or summary.get("sample_period")
-        or float(np.median(np.diff(frame["t"].to_numpy(float)))),
+        "period": summary.get("every") or summary.get("sample_period") or float(frame["t"].diff().median()),
         "held": "held_out" in frame and bool(frame["held_out"].any()),
         "coordinates": coordinates,
         "over": _first(summary, frame) or [line["column"] for line in coordinates[1:3]],
@@ -83,16 +81,10 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     }
 
 
-def _is_run(summary: JsonObject) -> bool:
-    return "single_run" in summary
-
-
-def _errors(trace: DataFrame) -> dict[str, np.ndarray]:
+def _errors(trace: DataFrame) -> dict[str, pd.Series]:
     """Compute what the observers of a simulated run are off by: true less observed."""
-    pairs = {f"{side}.{name}_error": (f"{side}.{name}", f"{side}.{name}_estimate")
-             for side in POSITION_CHANNELS for name in ("position", "velocity")}  # fmt: skip
-    columns = {name: pair for name, pair in pairs.items() if {*pair} <= {*trace}}
-    return {name: trace[true].to_numpy() - trace[estimate].to_numpy() for name, (true, estimate) in columns.items()}
+    names = [f"{side}.{name}" for side in POSITION_CHANNELS for name in ("position", "velocity")]
+    return {f"{name}_error": trace[name] - trace[f"{name}_estimate"] for name in names if f"{name}_estimate" in trace}
 
 
 def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
@@ -119,12 +111,11 @@ def _force(unit: str) -> str:
 
 def _turns(trace: DataFrame, units: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Positions within a turn."""
-    turns = {
-        f"{side}.turn": within_turn(trace[name].to_numpy())
+    return {
+        f"{side}.turn": turns
         for side, name in POSITION_CHANNELS.items()
-        if name in trace and units[side] == "rad"
+        if name in trace and units[side] == "rad" and (turns := within_turn(trace[name].to_numpy())) is not None
     }
-    return {name: values for name, values in turns.items() if values is not None}
 
 
 def _coordinates(frame: DataFrame, units: Mapping[str, str]) -> Iterable[dict[str, str]]:
@@ -166,12 +157,15 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
         drawn = [{"column": column, "label": label} for column, label in lines.items() if column in frame]
         return {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": drawn}
 
-    law, speed = ("true", "true") if _is_run(summary) else ("by the fitted law", "smoothed")
+    law, speed = ("true", "true") if "single_run" in summary else ("by the fitted law", "smoothed")
     bandwidths = summary.get("gap", {}).get("holdout", {}).get("bandwidth", {})
     last = summary["findings"][-1]["effect"] if summary.get("findings") else ""
     for side, unit in units.items():
         quantity = f"missing {missing_quantity(_force(unit))}"
-        lines = {f"{side}.missing_before": "model as given", f"{side}.missing_after": _AFTER if last else "numbers fitted"}
+        lines = {
+            f"{side}.missing_before": "model as given",
+            f"{side}.missing_after": "with the missing effects" if last else "numbers fitted",
+        }
         for column in map(str, frame):
             kind, _, effect = column.removeprefix(f"{side}.").partition(".")
             if kind == "missing_without":
@@ -198,6 +192,3 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
         lines = {f"{side}.velocity": speed, f"{side}.velocity_estimate": "by the observer"}
         if f"{side}.velocity_estimate" in frame:
             yield group(f"{side}: speed", "speed", f"{unit}/s", lines)
-
-
-_AFTER = "with the missing effects"

@@ -105,9 +105,8 @@ def write_study(
     config = result.config
     content = _about(config, result.columns, studies) | {"lead": list(lead), "served": served}
     names = [metric["name"] for metric in content["metrics"]]
-    content |= (
-        write_cloud(result, names, out) if dimensions(config) is None else write_grid(result, names, content["first"], out)
-    )
+    dims = dimensions(config)
+    content |= write_cloud(result, names, out) if dims is None else write_grid(result, names, content["first"], out, dims)
     (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
     write_page(out, ("study", "runs", "views"), content, scripts=not served)
     return not result.is_finished(content["found"])
