@@ -1,33 +1,44 @@
 """What `jaxbl diagnose` leaves to be read: missing effects, their probability, and model errors before and after."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
+from jaxbl.diagnosis.localise import Coordinate, Localised
+from jaxbl.diagnosis.residuals import Residual, narrow
+from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
+from jaxbl.records.least_squares import rms
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .motor_alone_figures import draw_motor_alone
 from .numbers import lead_with_doubt, number_table, write_fit
 from .panels import (
     BLUE,
+    MISSING,
     ORANGE,
+    SIDE_COLOURS,
     TIME,
     VERMILION,
     Axis,
+    Band,
     Figure,
+    Line,
     Panel,
+    Part,
     Span,
+    cloud,
+    intervals,
     missing_label,
-    stack,
+    with_unit,
 )
-from .residuals import draw_residual, torque_parts
 
 _BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
@@ -63,8 +74,9 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     gap, figures = summary["gap"], []
     errors = _errors_of_channels(gap)
     for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
-        if there := [(name, *errors[name][:3]) for name in channels if name in errors]:
-            name, before, after, noise = max(there, key=lambda row: _ratio(row[1], row[3]))
+        if there := [name for name in channels if name in errors]:
+            name = max(there, key=lambda name: _ratio(errors[name][0], errors[name][2]))
+            before, after, noise, _ = errors[name]
             change = f"{rms_text(before)} → {rms_text(after)} {gap['units'][name]}"
             figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (noise {rms_text(noise)})"))
     if summary["findings"]:
@@ -337,4 +349,61 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
         f"{lead}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "
         "most clearly. A complete model stays within the grey band."
     )
-    return stack("before_after", panels, caption, 2.4)
+    return Figure("before_after", panels, caption, height=2.4)
+
+
+_SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
+_PANELS = 3
+"""Coordinates that are drawn: as many as are wide enough side by side."""
+
+
+def torque_parts(residual: Residual, bandwidth: float, name: str, *, noise: bool = True, **how: Any) -> list[Part]:
+    """A residual over time behind the low-pass that the analysis used, and its noise as a band."""
+    low, _ = narrow(residual, bandwidth)
+    band = [Band(low.time, -2.0 * low.deviation, 2.0 * low.deviation, "± 2 noise", MISSING, 0.75)]
+    return [*band * noise, Line(low.time, low.torque, name, **how)]
+
+
+def draw_residual(
+    parts: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], located: Localised, unit: str
+) -> Figure:
+    """Draw the residual torque of a side over the coordinates that explain most of it.
+
+    Args:
+        parts: of the record.
+        coordinates: of each part, by name.
+        located: what was found of these torques.
+        unit: theirs.
+    """
+    by_name = located.coordinates
+    names = [name for name in _SHOWN if name in by_name]
+    # those that explain most, speed always
+    drawn = sorted(names, key=lambda name: (name != "speed", -by_name[name].explained))[:_PANELS]
+    lows, rows = zip(*(narrow(part, located.bandwidth) for part in parts), strict=True)
+    torque = np.concatenate([low.torque for low in lows])
+    noise = rms(np.concatenate([low.deviation for low in lows]))
+    limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
+    y, panels = Axis(missing_label(f"{located.name}: ", unit), ends=(-limit, limit)), []
+    for name in sorted(drawn, key=names.index):
+        coordinate = by_name[name]
+        values = np.concatenate([part[name].values[row] for part, row in zip(coordinates, rows, strict=True)])
+        band = Span(-2.0 * noise, 2.0 * noise, "± 2 noise", MISSING, "y", 0.6)
+        dots = cloud(values, torque, colour=SIDE_COLOURS[located.name])
+        x = Axis(with_unit(f"{name} {coordinate.symbol}".rstrip(), coordinate.unit))
+        panels.append(Panel(x, y, [band, dots, *_means(coordinate)], f"explains {100.0 * coordinate.explained:.0f} %"))
+    sentence = sentence_of(located, unit)
+    caption = (
+        f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, marks with strokes the means of bins "
+        "with twice their standard errors; hollow where a mean does not differ significantly from zero. Above: share of the "
+        "power beyond the noise that a function of this coordinate alone explains, on data that it was not fitted to."
+    )
+    return Figure(f"residual_{located.name}", panels, caption, len(panels), max(3.2 * len(panels), 4.4))
+
+
+def _means(coordinate: Coordinate) -> list[Line]:
+    rows = [(0.5 * (bin_.low + bin_.high), bin_.mean, bin_.mean_error, bin_.mean_z) for bin_ in coordinate.regions]  # pyright: ignore
+    x, y, error, z = np.array(rows).reshape(-1, 4).T
+    ends, points = intervals(x, y - 2.0 * error, y, y + 2.0 * error, "bin mean", upright=True, size=4.0)
+    unsure = np.abs(z) <= 3.0
+    hollow = points._replace(x=x[unsure], y=y[unsure], name="", fill="#FFFFFF")
+    return [Line(x, y, width=1.0, opacity=0.7), ends, points, hollow]

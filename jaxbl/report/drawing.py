@@ -348,15 +348,13 @@ def _legend_handles(panel: Panel) -> dict[str, Any]:
     """The legend's handle of each name in a panel that does not stand beside its line."""
     handles: dict[str, Any] = {}
     for part in panel.parts:
-        name = getattr(part, "name", "")
-        if isinstance(part, Map) and not np.any(part.failed):
-            continue
-        if not name or name in handles or (isinstance(part, Line) and part.at_line):
+        is_hidden = part.at_line if isinstance(part, Line) else isinstance(part, Map) and not np.any(part.failed)
+        if is_hidden or not part.name or part.name in handles:
             continue
         if isinstance(part, Line):
-            handles[name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
+            handles[part.name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
         elif isinstance(part, Span) and part.low == part.high:
-            handles[name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
+            handles[part.name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
         else:
-            handles[name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
+            handles[part.name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
     return handles

@@ -23,7 +23,6 @@ from .panels import (
     Panel,
     cloud,
     draw_signals,
-    stack,
 )
 
 _LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
@@ -101,7 +100,7 @@ def _channels(record: Record) -> Figure:
     unit = f"{channels[POSITION_CHANNELS[side]].unit}/s"
     signals.append((compute_velocity(record, side), f"{side} velocity", unit, PURPLE))
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
-    return stack("channels", draw_signals(record.time, record.segments, signals), caption, 1.5)
+    return Figure("channels", draw_signals(record.time, record.segments, signals), caption, height=1.5)
 
 
 def _twist(inspection: Inspection) -> Figure:

@@ -163,8 +163,9 @@ def with_value(config: Config, path: str, value: Any) -> str:
     return f"{path_words(config, path)} {text}"
 
 
-def _panel_title(config: Config, spec: FigureTable, value: Any) -> str:
-    return "" if spec.facet is None else with_value(config, spec.facet, value)
+def _part_name(config: Config, path: str | None, value: Any) -> str:
+    """Words for the value that a panel or a line is of; "" where there is one alone."""
+    return "" if path is None else with_value(config, path, value)
 
 
 def _text(value: Any) -> str:
@@ -198,7 +199,7 @@ def flat_remark(values: Array) -> str:
     return f"flat: within {100 * AS_GOOD:g} %" if is_flat else ""
 
 
-def colour_scale(values: Array, label: str, scale: str = "auto") -> Scale:
+def colour_scale(values: Array, label: str, scale: str) -> Scale:
     """Colours of values: logarithmic where they are positive and span more than a factor of 30, one colour where they are
     flat."""
     finite = values[np.isfinite(values)]
@@ -233,12 +234,12 @@ def is_log(config: Config, path: str, values: Array) -> bool:
     return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
 
 
-def _split(table: Any, spec: FigureTable) -> list[tuple[Any, Any]]:
-    """The value of each panel, and the panel's part of a table or of rows; None and all where there is one panel."""
-    if spec.facet is None:
+def _split(table: Any, path: str | None) -> list[tuple[Any, Any]]:
+    """The value of each panel or line, and its part of a table or of rows; None and all where there is one alone."""
+    if path is None:
         return [(None, table)]
-    parts = table.groupby(spec.facet, sort=True)
-    return [(value, part.droplevel(0) if spec.facet in part.index.names else part) for value, part in parts]
+    parts = table.groupby(path, sort=True)
+    return [(value, part.droplevel(0) if path in part.index.names else part) for value, part in parts]
 
 
 def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Series:
@@ -267,7 +268,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         # a refined study has its points for their places: all of them are filled
         filling = Filling(points, rows.frame, *axes)
         unseen = [path for path in paths if path not in keys]
-        filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec)]
+        filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec.facet)]
         groups = Groups(filled, keys, paths)
     table, converged = _map_table(groups, next(iter(filled)), spec.value), f"{side}.converged"
     bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
@@ -275,14 +276,14 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
     if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
         # of a refined study those that were simulated
         has_margin = f"{side}.margin_alpha" in next(iter(filled))
-        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec))
+        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec.facet))
     # what failed sets no colour
     table["shown"] = table["value"].where(~table["failed"])
     scale = colour_scale(table["shown"].to_numpy(float), value_label(spec.value), spec.scale)
     if is_boolean(spec.value):
         scale = scale._replace(low=0.0, high=1.0, log=False)
     failure, drawn = _failure_name(table[table["failed"]], spec.value), []
-    for i, (value, part) in enumerate(_split(table, spec)):
+    for i, (value, part) in enumerate(_split(table, spec.facet)):
         plane = part[["value", "failed"]].astype(float)
         # what an unfinished study has not computed yet stays white
         plane = plane if filling is None else filling.fill(plane).fillna({"failed": 1.0})
@@ -300,7 +301,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
             alphas = (x if alpha_is_x else y).ends
             parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {bound:.3g} rad/s²")
-        title = "\n".join(filter(None, (_panel_title(config, spec, value), ",  ".join(filter(None, under)))))
+        title = "\n".join(filter(None, (_part_name(config, spec.facet, value), ",  ".join(filter(None, under)))))
         drawn.append(Panel(x, y, parts, title))
     return drawn, f" and {path_words(config, spec.y)}{_over(config, groups.varied, spec)}."
 
@@ -386,17 +387,16 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
         table["middle"] = spread.median
     band, drawn = "", []
     scale = colour_scale(np.concatenate([spread.least, spread.largest]), value_label(spec.value), spec.scale)
-    for facet, part in _split(table.reset_index(), spec):
-        lines, parts = [(None, part)] if spec.series is None else part.groupby(spec.series, sort=True), list[Part]()
-        for i, (value, line) in enumerate(lines):
-            x, colour = line[spec.x], COLOURS[i % len(COLOURS)]
-            name = "" if value is None else with_value(config, spec.series, value)
+    for facet, part in _split(table.reset_index(), spec.facet):
+        parts = list[Part]()
+        for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
+            x, name = line[spec.x], _part_name(config, spec.series, value)
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
             parts.append(Line(x, line["middle"], name, colour, marker="o", size=3.5))
         x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
-        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _panel_title(config, spec, facet)))
+        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _part_name(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
 
 
@@ -415,7 +415,9 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
                 Line(ends, ends if law.fit is None else law.fit(ends), name, colour),
             ]
         x, _ = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
-        panels.append(Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _panel_title(config, spec, facet)))
+        panels.append(
+            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _part_name(config, spec.facet, facet))
+        )
     seeds = config.sweep.seeds
     return panels, (
         f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines with their slopes: least "

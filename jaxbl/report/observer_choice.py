@@ -34,7 +34,6 @@ from .panels import (
     arrange,
     intervals,
     name_rows,
-    place_words,
     tick_text,
 )
 from .tune import error_label, for_title, write_gains
@@ -62,7 +61,7 @@ def _ratios(summary: JsonObject) -> Figure:
         parts: list[Part] = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
             *intervals(range(len(high)), low, ratio, high, colour=SIDE_COLOURS[side]),
-            place_words([*high, *[0.9] * len(lost)], range(len(kinds)), texts),
+            Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
         ]
         x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + max(high, default=1.0)) ** 1.5))
         panels.append(Panel(x, name_rows([*compared, *lost]), parts, side))

@@ -191,11 +191,6 @@ class Figure(NamedTuple):
     height: float = 3.6
 
 
-def stack(name: str, panels: Sequence[Panel], caption: str, height: float = 1.7) -> Figure:
-    """Panels of signals one above the other."""
-    return Figure(name, panels, caption, height=height)
-
-
 def arrange(count: int) -> int:
     """Columns of so many panels."""
     return 2 if count == 4 else min(count, 3)
@@ -247,14 +242,9 @@ ZERO = Span(0.0, 0.0, colour=FAINT, along="y", width=0.8, dashes="-")
 """A faint line at y = 0."""
 
 
-def place_words(x: Any, y: Any, texts: Sequence[str]) -> Line:
-    """Words beside places."""
-    return Line(x, y, width=0.0, marker=" ", texts=texts)
-
-
-def shade_gap(half: float, name: str) -> Span:
-    """The gap of a transmission over its twist; `half` of it lies on either side of 0."""
-    return Span(-half, half, name, "#F3E3A1", opacity=0.6)
+def shade_gap(half: float, name: str) -> list[Span]:
+    """The gap of a transmission over its twist, if it has one; `half` of it lies on either side of 0."""
+    return [Span(-half, half, name, "#F3E3A1", opacity=0.6)] if half else []
 
 
 def thin(part: Part) -> Part:
@@ -288,19 +278,18 @@ def envelope(low: Any, high: Any) -> list[Array]:
     return rows
 
 
-def limits(*values: Any, share: float = 0.001, room: float = 0.12, inside: Sequence[float] = ()) -> Pair | None:
+def limits(*values: Any, inside: Sequence[float] = ()) -> Pair | None:
     """Ends of an axis that a few outliers do not set; None (those of what is drawn) where no value is finite.
 
-    `share` of the values may lie outside at each end, `room` is added there as a share of the span, and `inside` lie within
-    in any case.
+    A thousandth of the values may lie outside at each end, and 12 % of the span is added; `inside` lie within in any case.
     """
     finite = np.concatenate(values)
     finite = finite[np.isfinite(finite)]
     if not len(finite):
         return None
-    low, high = np.quantile(finite, [share, 1.0 - share])
-    low, high = min(low, high, *inside), max(low, high, *inside)
-    margin = room * (high - low) or 1e-12 + 0.1 * abs(high)
+    ends = [*np.quantile(finite, [0.001, 0.999]), *inside]
+    low, high = min(ends), max(ends)
+    margin = 0.12 * (high - low) or 1e-12 + 0.1 * abs(high)
     return float(low - margin), float(high + margin)
 
 
@@ -384,8 +373,8 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
     for part in map(thin, panel.parts):
         if isinstance(part, Line | Band | Span):
             fields = part._asdict() | {"sorted": isinstance(part, Line) and part.is_sorted}
-            curves = () if isinstance(part, Span) else ("x", "y", "low", "high")
-            fields |= {key: pack_numbers(values) for key, values in fields.items() if key in curves}
+            curves = set() if isinstance(part, Span) else {"x", "y", "low", "high"}
+            fields |= {key: pack_numbers(fields[key]) for key in fields.keys() & curves}
             content[f"{type(part).__name__.lower()}s"].append(fields)
         elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
             cells = {key: pack_numbers(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}

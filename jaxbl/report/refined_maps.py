@@ -24,16 +24,17 @@ class Filling:
 
     def __init__(self, points: Points, frame: DataFrame, x: str, y: str):
         assert points.refinement is not None
-        self.paths, self._values, self._cells = [y, x], [], []
-        for path in self.paths:
+        # values of each axis, and how many of them a coarse cell has
+        self._axes: dict[str, tuple[Array, int]] = {}
+        for path in (y, x):
             refined = path in points.refinement.paths
-            self._values.append(points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float)))
-            self._cells.append(1 << refined * points.refinement.grid.depth)
+            values = points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float))
+            self._axes[path] = values, 1 << refined * points.refinement.grid.depth
 
     def _places(self, frame: DataFrame) -> Array:
         """Positions `(rows, 2)` of a frame's rows in the plane, in coarse cells."""
-        positions = zip(self._values, self._cells, (frame[path] for path in self.paths), strict=True)
-        return np.stack([np.searchsorted(values, column) / cell for values, cell, column in positions], axis=1)
+        places = [np.searchsorted(values, frame[path]) / cell for path, (values, cell) in self._axes.items()]
+        return np.stack(places, axis=1)
 
     def _nearest(self, simulated: DataFrame, asked: DataFrame) -> Array:
         """The simulated row nearest to each row asked for, within half a coarse cell; their number where there is none."""
@@ -42,8 +43,7 @@ class Filling:
 
     def fill(self, table: DataFrame) -> DataFrame:
         """A table over (y, x) on the whole plane: rows of the nearest places, NaN where there is none."""
-        drawn_values = map(_drawn_values, self._values, self._cells)
-        plane = pd.MultiIndex.from_product(drawn_values, names=self.paths)
+        plane = pd.MultiIndex.from_product([_drawn_values(*axis) for axis in self._axes.values()], names=[*self._axes])
         nearest = self._nearest(table.index.to_frame(), plane.to_frame())
         return table.reset_index(drop=True).reindex(nearest).set_axis(plane)
 
@@ -54,7 +54,7 @@ class Filling:
         """
         if not paths or frame.empty:
             return frame
-        vertices, parts = frame[self.paths].drop_duplicates(), []
+        vertices, parts = frame[[*self._axes]].drop_duplicates(), []
         for _, part in frame.groupby([*paths, "seed"], sort=False):
             nearest = self._nearest(part, vertices)
             there = nearest < len(part)

@@ -89,15 +89,11 @@ class Drawings(list[Figure]):
     """Figures (:class:`jaxbl.report.panels.Figure`), which a notebook shows."""
 
     def _repr_html_(self) -> str:
-        return "".join(map(_format_figure, self))
-
-
-def _format_figure(figure: Figure) -> str:
-    image = picture(figure)
-    return (
-        f'<figure><img src="{image.source}" alt="{escape(image.described)}" style="max-width:100%">'
-        f"<figcaption>{escape(image.caption)}</figcaption></figure>"
-    )
+        return "".join(
+            f'<figure><img src="{image.source}" alt="{escape(image.described)}" style="max-width:100%">'
+            f"<figcaption>{escape(image.caption)}</figcaption></figure>"
+            for image in map(picture, self)
+        )
 
 
 def draw(result: Any, *names: str) -> Drawings:

@@ -24,7 +24,6 @@ from .panels import (
     Figure,
     Line,
     Panel,
-    stack,
 )
 
 
@@ -111,7 +110,7 @@ def _compare(
         Panel(TIME, Axis(f"{quantity} ({unit})"), [*above, Line(time, true, label, width=1.0)]),
         Panel(TIME, Axis(f"error ({unit})"), [ZERO, *below]),
     ]
-    return stack(name, panels, caption)
+    return Figure(name, panels, caption, height=1.7)
 
 
 def _hysteresis(trace: DataFrame) -> Figure:

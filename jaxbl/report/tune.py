@@ -45,16 +45,11 @@ def error_label(summary: JsonObject) -> str:
 def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
-    coarse = tuning.candidates[side].query("stage == 0")
-    tables = coarse.astype({"feasible": float}).pivot_table(
-        index="lambda",
-        columns="alpha",
-        values=["error", "feasible"],
-        dropna=False,
-    )
-    grid, failed = tables["error"].to_numpy(float), ~(tables["feasible"].to_numpy(float) >= 0.5)
+    coarse = tuning.candidates[side].query("stage == 0").astype({"feasible": float})
+    error, feasible = (coarse.pivot_table(name, "lambda", "alpha", dropna=False) for name in ("error", "feasible"))
+    grid, failed = error.to_numpy(float), ~(feasible.to_numpy() >= 0.5)
     values = np.where(failed, np.nan, grid)
-    x, y = (cell_edges(axis.to_numpy(float), True) for axis in (tables["error"].columns, tables.index))
+    x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
     alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
     parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]

@@ -57,10 +57,6 @@ def _atlas(verdict: Verdict) -> Figure:
     return Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
 
 
-def _name(level: JsonObject) -> str:
-    return ", ".join(level[key] for key in ("level", "side") if level.get(key))
-
-
 def write(verdict: Verdict, folder: Path) -> str:
     """Return the study's TOML; the command has left the other files."""
     return verdict.config.to_toml()
@@ -128,9 +124,8 @@ def _level_lines(verdict: Verdict) -> Lines:
             counts = ", ".join(f"{entry['title']} {entry['counterexamples']} of {entry['holds']}" for entry in wrong)
             causes = list(level["causes"].get("true", {}).items())[:4]
             text = ", ".join(f"{cause} ({count})" for cause, count in causes)
-            lines.append(
-                f"{_name(level)}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}."
-            )
+            name = ", ".join(level[key] for key in ("level", "side") if level.get(key))
+            lines.append(f"{name}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}.")
     return lines
 
 

@@ -14,7 +14,7 @@ from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, 
 from jaxbl.result import KeyFigure, Result
 
 from .numbers import lead_with_doubt
-from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits, stack, stretches
+from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits, stretches
 
 VALUES = "watch.csv"
 SUMMARY = "watch.json"
@@ -100,13 +100,13 @@ def draw(watch: Watch) -> list[Figure]:
     values, task, limit = watch.values, watch.task, watch.task.alarm_gap
     law = [name for name in ("half_gap", "stiffness") if f"motor.{name}" in values]
     # friction of each side acts on a shaft of its own
-    rows = [(name, SIDES) for name in law] + [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
+    friction = [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
     if not len(values):
         return []
     time, panels = values["t"].to_numpy(float), []
     half = 0.5 * task.interval
     x = Axis("time (s)", ends=(time[0] - half, time[-1] + half))
-    for name, sides in rows:
+    for name, sides in [*((name, SIDES) for name in law), *friction]:
         parts, curves, inside = list[Part](), [], []
         if name == "half_gap" and limit is not None:
             inside = [limit]
@@ -131,4 +131,4 @@ def draw(watch: Watch) -> list[Figure]:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
     # gap and stiffness are seen at once, friction below
     parted = {"watch": panels[: len(law)], "watch_friction": panels[len(law) :]}
-    return [stack(name, part, caption, 1.5) for name, part in parted.items() if part]
+    return [Figure(name, part, caption, height=1.5) for name, part in parted.items() if part]

@@ -17,8 +17,7 @@ from jaxbl.estimation.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.records.least_squares import rms
 from jaxbl.report.drawing import save
-from jaxbl.report.identify import describe as describe_identification
-from jaxbl.report.identify_figures import LogSignals, draw as draw_identification
+from jaxbl.report.identify import LogSignals, describe as describe_identification, draw as draw_identification
 from jaxbl.report.results import write_report
 from jaxbl.sweeps.trial import run
 
