@@ -61,8 +61,7 @@ def describe(comparison: Comparison) -> Result:
     changed = sorted(
         (change for change in comparison.metrics if change.count or change.is_sure), key=lambda change: not change.better
     )
-    judged = [_split(change) for change in changed if change.better]
-    better, worse = (sum(counts) for counts in zip(*judged, strict=True)) if judged else (0, 0)
+    better, worse = (sum(_split(change)[i] for change in changed if change.better) for i in range(2))
     verdict, headline = "good", f"No metric differs by more than {beyond} at {common} common points."
     if not common:
         verdict, headline = "no answer", "No point is in both studies: no metric is compared."

@@ -271,23 +271,23 @@ def _residuals(log: LogSignals) -> Figure:
     )
 
 
-def _mean_over(twist: Array, torque: Array, rows: Array, span: Pair) -> tuple[Array, Array]:
-    """Mean torque of some rows in bins of twist; NaN in bins of fewer than four samples."""
-    bins = int(np.clip(len(rows) // 15, 24, 80))
-    count, edges = np.histogram(twist[rows], bins, span)
-    total, _ = np.histogram(twist[rows], bins, span, weights=torque[rows])
+def _mean_over(twist: Array, torque: Array, span: Pair) -> tuple[Array, Array]:
+    """Mean torque in bins of twist; NaN in bins of fewer than four samples."""
+    bins = int(np.clip(len(twist) // 15, 24, 80))
+    count, edges = np.histogram(twist, bins, span)
+    total, _ = np.histogram(twist, bins, span, weights=torque)
     return 0.5 * (edges[1:] + edges[:-1]), np.where(count >= 4, total / np.maximum(count, 1), np.nan)
 
 
 def _means(log: LogSignals, x: Array, torque: Array, rate: Array, name: str, span: Pair | None) -> list[Line]:
     """Settled samples of a torque over x, as far as it goes, and their means for both signs of its rate."""
-    rows = np.arange(len(rate))[log.settled]
-    rows = rows[np.isfinite(torque[rows])]
     if span is None:
         return []
-    return [cloud(x[log.settled], torque[log.settled])] + [
-        Line(*_mean_over(x, torque, rows[chosen], span), f"mean, {name} {word}", colour, 2.4, opacity=0.9)
-        for word, colour, chosen in (("growing", GREEN, rate[rows] > 0.0), ("falling", PURPLE, ~(rate[rows] > 0.0)))
+    x, torque, rate = (signal[log.settled] for signal in (x, torque, rate))
+    finite, grows = np.isfinite(torque), rate > 0.0
+    return [cloud(x, torque)] + [
+        Line(*_mean_over(x[chosen], torque[chosen], span), f"mean, {name} {word}", colour, 2.4, opacity=0.9)
+        for word, colour, chosen in (("growing", GREEN, finite & grows), ("falling", PURPLE, finite & ~grows))
     ]
 
 

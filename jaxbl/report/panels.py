@@ -224,8 +224,8 @@ def intervals(
     rows = np.repeat(np.asarray(places, float), 3)
     pairs = (ends, rows), (middle, places)
     bar, points = ((y, x) if upright else (x, y) for x, y in pairs)
-    colour = how.get("colour", BLACK)
-    return [Line(*bar, colour=colour, width=1.8, opacity=0.6), Line(*points, name, **{"width": 0.0, "marker": "o"} | how)]
+    bars = Line(*bar, colour=how.get("colour", BLACK), width=1.8, opacity=0.6)
+    return [bars, Line(*points, name, **{"width": 0.0, "marker": "o"} | how)]
 
 
 def mark(x: float, y: float, name: str, marker: str = "*", size: float = 14.0) -> Line:
@@ -251,10 +251,9 @@ def thin(part: Part) -> Part:
     """A line or a band with as many points as can be seen: of a signal least and largest of each of its bins, of a path or
     a cloud every n-th."""
     if isinstance(part, Band):
-        rows = envelope(part.low, part.high)
-        return part._replace(
-            x=np.asarray(part.x)[rows[0]], low=np.asarray(part.low)[rows[0]], high=np.asarray(part.high)[rows[1]]
-        )
+        x, low, high = map(np.asarray, part[:3])
+        least, largest = envelope(low, high)
+        return part._replace(x=x[least], low=low[least], high=high[largest])
     if not isinstance(part, Line) or len(part.x) <= _LINE_POINTS:
         return part
     x, y = np.asarray(part.x, float), np.asarray(part.y, float)

@@ -1,7 +1,6 @@
 """What `jaxbl watch` leaves: values over time as CSV, a summary, one figure, and a page."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -80,9 +79,8 @@ def describe(watch: Watch) -> Result:
     return result if verdict == "failed" else lead_with_doubt(result)
 
 
-@contextmanager
-def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject], None]]:
-    """`watch.csv` while it grows, from the first values on: a function that adds values, which others can read at once."""
+def open_values(folder: Path, task: WatchTask) -> Callable[[JsonObject], None]:
+    """Return a function that adds values to `watch.csv`, which others can read at once; the first ones begin it anew."""
     mode = "w"
 
     def add(values: JsonObject) -> None:
@@ -92,7 +90,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
             row.to_csv(folder / VALUES, mode=mode, header=mode == "w", index=False)
         mode = "a"
 
-    yield add
+    return add
 
 
 def draw(watch: Watch) -> list[Figure]:
