@@ -93,9 +93,9 @@ def draw(result: StudyResult) -> list[Figure]:
 def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     """The rows that a figure shows, with the columns that it needs; of a quasi-random design at the middles of bins."""
     config = result.config
-    names = "converged", "f_plus", "margin_alpha"
-    metrics = {figure.value, "finite", *(f"{side}.{name}" for side in config.sides for name in names)}
-    columns = [*config.axis_paths, "seed", *(name for name in result.columns if name in metrics)]
+    names = "finite", "converged", "f_plus", "margin_alpha"
+    metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
+    columns = [*config.axis_paths, "seed", *metrics]
     random = [axis for axis in config.axes if axis.path in (figure.x, figure.y) and axis.values is None and axis.num is None]
     # about four points in each bin of a map
     bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))

@@ -292,12 +292,6 @@ def limits(*values: Any, inside: Sequence[float] = ()) -> Pair | None:
     return float(low - margin), float(high + margin)
 
 
-def stretches(there: Any) -> list[tuple[int, int]]:
-    """First, and one after the last, index of each stretch that is true."""
-    steps = np.flatnonzero(np.diff(there, prepend=False, append=False))
-    return list(zip(steps[::2], steps[1::2], strict=True))
-
-
 def round_ticks(low: float, high: float) -> list[float]:
     """Round places on a logarithmic axis: its decades, or of fewer than two 1, 2 and 5 in each."""
     first, last = (math.log10(end) for end in sorted((low, high)))

@@ -49,9 +49,6 @@ class _Kind(NamedTuple):
     file: str = PAGE
     subject: Callable[[Any], Subject] = lambda result: study_subject(result.config)
 
-    def describe(self, result: Any) -> Result:
-        return self.report.describe(result.summary if self.subject is _log else result)
-
 
 def _log(result: Any) -> Subject:
     return log_subject(Path(result.summary["file"]))
@@ -115,7 +112,8 @@ def describe(result: Any) -> Result:
     Raises:
         InputError: no result of these.
     """
-    described, cost = _kind_of(result).describe(result), getattr(result, "cost", None)
+    kind, cost = _kind_of(result), getattr(result, "cost", None)
+    described = kind.report.describe(result.summary if kind.subject is _log else result)
     details = [*described.details]
     if cost and cost["lanes"]:
         compiling, computing = format_duration(cost["compile_seconds"]), format_duration(cost["run_seconds"])

@@ -37,7 +37,11 @@ def describe(result: StudyResult) -> Result:
     tables = [_law_table(laws)] * bool(laws)
     tables += (_importance_table(side, ranked) for side, ranked in survey.importance.items())
     answer = answer_sweep(result, survey)
-    return replace(answer, remarks=[*answer.remarks, *_law_lines(laws)], tables=tables)
+    # the table says which
+    agreeing = (
+        f"Accuracy laws: {sum(law.agrees for law in laws)} of {len(laws)} have a slope within {AGREEMENT:g} of theory."
+    )
+    return replace(answer, remarks=[*answer.remarks, *[agreeing] * bool(laws)], tables=tables)
 
 
 def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result:
@@ -98,8 +102,8 @@ class _Survey:
     def __init__(self, result: StudyResult):
         config = result.config
         paths = config.axis_paths
-        metrics = [f"{side}.{name}" for side in config.sides for name in ("converged", "velocity_rmse", "margin_alpha")]
-        metrics = [name for name in metrics if name in result.columns]
+        names = "converged", "velocity_rmse", "margin_alpha"
+        metrics = [column for column in result.columns if column.rpartition(".")[2] in names]
         self.sides = [side for side in config.sides if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(config)
@@ -151,12 +155,6 @@ def _best_lines(side: str, best: BestGains | None) -> Lines:
         f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
         for gain, way in best.ends.items()
     ]
-
-
-def _law_lines(laws: list[Law]) -> Lines:
-    """Say how many laws agree with theory; the table says which."""
-    count = sum(law.agrees for law in laws)
-    return [f"Accuracy laws: {count} of {len(laws)} have a slope within {AGREEMENT:g} of theory."] * bool(laws)
 
 
 def _explain_ends(law: Law) -> str:

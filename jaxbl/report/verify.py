@@ -42,7 +42,8 @@ def _mark_gains(verdict: Verdict) -> list[Line]:
 def _atlas(verdict: Verdict) -> Figure:
     plane = verdict.error_map
     scale = Scale(0.05, 20.0, "ratio ρ of successive velocity peaks, simulated", True, "PuOr_r")
-    edges = [cell_edges(values, True) for values in (plane.alpha, plane.lambda_)]
+    ranges = {"α / f⁺": plane.alpha, "λ / √f⁺": plane.lambda_}
+    edges = [cell_edges(values, True) for values in ranges.values()]
     curves = condition_curves(list_conditions(verdict.config), 1.0, (plane.alpha[0], plane.alpha[-1]))
     step = max(len(plane.alpha) // 24, 1)
     boundary = Line(plane.alpha[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
@@ -52,8 +53,7 @@ def _atlas(verdict: Verdict) -> Figure:
         f"Simulated ratio of successive velocity peaks over {plane.ratio.size} cells; every condition demands a λ above its "
         "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
-    pairs = (("α / f⁺", plane.alpha), ("λ / √f⁺", plane.lambda_))
-    axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in pairs)
+    axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in ranges.items())
     return Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
 
 

@@ -10,10 +10,11 @@ from jaxbl.files import catch_write_errors, write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
+from jaxbl.records.signal_quality import find_runs
 from jaxbl.result import KeyFigure, Result
 
 from .numbers import lead_with_doubt
-from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits, stretches
+from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits
 
 VALUES = "watch.csv"
 SUMMARY = "watch.json"
@@ -110,7 +111,7 @@ def draw(watch: Watch) -> list[Figure]:
             inside = [limit]
             parts += [
                 Span(time[start] - half, time[end - 1] + half, "alarm", VERMILION, opacity=0.12)
-                for start, end in stretches(values["alarm"].to_numpy(bool))
+                for start, end in zip(*find_runs(values["alarm"].to_numpy(bool)), strict=True)
             ]
             parts.append(Span(limit, limit, "limit", along="y", width=1.2))
         for side in sides:
