@@ -109,9 +109,10 @@ def draw(watch: Watch) -> list[Figure]:
         parts, curves, inside = list[Part](), [], []
         if name == "half_gap" and limit is not None:
             inside = [limit]
+            starts, ends = find_runs(values["alarm"].to_numpy(bool))
             parts += [
                 Span(time[start] - half, time[end - 1] + half, "alarm", VERMILION, opacity=0.12)
-                for start, end in zip(*find_runs(values["alarm"].to_numpy(bool)), strict=True)
+                for start, end in zip(starts, ends, strict=True)
             ]
             parts.append(Span(limit, limit, "limit", along="y", width=1.2))
         for side in sides:
