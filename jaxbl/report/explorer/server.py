@@ -33,7 +33,7 @@ _POLICY = (
 
 
 @contextmanager
-def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
+def start_server(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
     """A server for results, which waits for `serve_forever`; its pages are removed at the end.
 
     Raises:
