@@ -111,8 +111,8 @@ def draw(watch: Watch) -> list[Figure]:
             inside = [limit]
             starts, ends = find_runs(values["alarm"].to_numpy(bool))
             parts += [
-                Span(time[start] - half, time[end - 1] + half, "alarm", VERMILION, opacity=0.12)
-                for start, end in zip(starts, ends, strict=True)
+                Span(start, end, "alarm", VERMILION, opacity=0.12)
+                for start, end in zip(time[starts] - half, time[ends - 1] + half, strict=True)
             ]
             parts.append(Span(limit, limit, "limit", along="y", width=1.2))
         for side in sides:
