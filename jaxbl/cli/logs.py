@@ -308,7 +308,7 @@ def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | N
     from contextlib import ExitStack
 
     from jaxbl.monitoring.watch import format_values, run_watch
-    from jaxbl.report.watch import values_file
+    from jaxbl.report.watch import open_values
 
     quiet, as_json = is_quiet(context), context.params.get("json")
 
@@ -317,9 +317,7 @@ def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | N
             typer.echo(escape_unprintable(f"jaxbl: {text}"), err=True)
 
     with ExitStack() as stack:
-        keep = None
-        if folder is not None and task.record is None:
-            keep = stack.enter_context(values_file(folder, task))
+        keep = open_values(folder, task) if folder is not None and task.record is None else None
         ended = None if task.record is not None else stack.enter_context(watch_for_end_request())
 
         def show(values: JsonObject) -> None:

@@ -9,6 +9,7 @@ are sorted in a file.
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
@@ -26,40 +27,35 @@ _MOST_KEPT = 20_000_000
 """Values of rows that are kept: 160 MB."""
 
 
+@dataclass
 class Rows:
     """Some columns of a study's rows, to be gone through several times: kept where they are few, else read each time.
 
-    Args:
+    Attributes:
         result: the study.
         columns: names.
         changed: applied to each part.
         needs: columns that this looks at.
     """
 
-    def __init__(
-        self,
-        result: StudyResult,
-        columns: Iterable[str],
-        changed: Callable[[DataFrame], DataFrame] = lambda frame: frame,
-        needs: Iterable[str] = (),
-    ):
-        self._result, self._columns, self._changed = result, list(dict.fromkeys(columns)), changed
-        self._needs = tuple(needs)
+    result: StudyResult
+    columns: Sequence[str]
+    changed: Callable[[DataFrame], DataFrame] = lambda frame: frame
+    needs: Sequence[str] = ()
 
     def __iter__(self) -> Iterator[DataFrame]:
-        return self.some(self._columns)
+        return self.some(self.columns)
 
     def some(self, columns: Iterable[str]) -> Iterator[DataFrame]:
         """Some of the columns, or more."""
-        if self._result.runs * len(self._columns) <= _MOST_KEPT:
+        if self.result.runs * len(self.columns) <= _MOST_KEPT:
             return iter([self.frame])
-        return map(self._changed, self._result.batches([*columns, *self._needs]))
+        return map(self.changed, self.result.batches([*columns, *self.needs]))
 
     @functools.cached_property
     def frame(self) -> DataFrame:
         """All of them at once."""
-        parts = [self._changed(part) for part in self._result.batches(self._columns)]
-        return pd.concat(parts, ignore_index=True)
+        return pd.concat(map(self.changed, self.result.batches(self.columns)), ignore_index=True)
 
 
 class Distinct:

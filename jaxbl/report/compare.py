@@ -56,13 +56,12 @@ def tabulate_points(comparison: Comparison) -> pd.DataFrame:
 def describe(comparison: Comparison) -> Result:
     """Say which metrics changed by more than noise, whether for the better, and what changed in the config."""
     common, first, second = comparison.points
-    names, beyond = comparison.names, _noise_name(comparison)
+    names, beyond = comparison.names, "noise" if comparison.knows_noise else "rounding"
     # what says how well an observer does comes first
     changed = sorted(
         (change for change in comparison.metrics if change.count or change.is_sure), key=lambda change: not change.better
     )
-    judged = [_split(change) for change in changed if change.better]
-    better, worse = (sum(counts) for counts in zip(*judged, strict=True)) if judged else (0, 0)
+    better, worse = (sum(_split(change)[i] for change in changed if change.better) for i in range(2))
     verdict, headline = "good", f"No metric differs by more than {beyond} at {common} common points."
     if not common:
         verdict, headline = "no answer", "No point is in both studies: no metric is compared."
@@ -80,10 +79,9 @@ def describe(comparison: Comparison) -> Result:
         changes = ", ".join(f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.made_by.items())
         remarks.append(f"Computed by: {changes}.")
     alone = f"; {first} in the first alone, {second} in the second alone" if first or second else ""
-    remarks += [
-        f"Points: {common} in both{alone}.",
-        *([_noise(comparison)] if common else []),
-    ]
+    remarks.append(f"Points: {common} in both{alone}.")
+    if common:
+        remarks.append(_noise(comparison))
     for i, study in enumerate(names):
         gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
         if gone:
@@ -142,10 +140,6 @@ def _factor(change: MetricChange) -> str:
     return f"{value} ({' to '.join(interval)})" if interval else value
 
 
-def _noise_name(comparison: Comparison) -> str:
-    return "noise" if comparison.knows_noise else "rounding"
-
-
 def _value(value: Any) -> str:
     if value is None:
         return "(none)"
@@ -154,16 +148,16 @@ def _value(value: Any) -> str:
 
 def draw(comparison: Comparison) -> list[Figure]:
     """Mean and spread of the factor of each metric that changed and has one; nothing where there is none."""
-    changes = sorted((change for change in comparison.metrics if change.count), key=lambda change: not change.better)
+    changes = [change for change in comparison.metrics if change.count and not is_boolean(change.metric)]
     rows = {}
-    for metric, mean in ((change.metric, change.moved.value) for change in changes if not is_boolean(change.metric)):
-        factor = _divide(comparison.frame(metric), metric).replace([np.inf, 0.0], np.nan)
+    for change in sorted(changes, key=lambda change: not change.better):
+        factor = _divide(comparison.frame(change.metric), change.metric).replace([np.inf, 0.0], np.nan)
         if factor.gt(0.0).any():
-            rows[value_label(metric)] = factor.quantile(0.05), mean, factor.quantile(0.95)
+            rows[value_label(change.metric)] = factor.quantile(0.05), change.moved.value, factor.quantile(0.95)
     if not rows:
         return []
-    names = list(rows)[:_ROWS]
-    ends = zip(*(rows[name] for name in names), strict=True)
+    names, factors = zip(*[*rows.items()][:_ROWS], strict=True)
+    ends = zip(*factors, strict=True)
     parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(range(len(names)), *ends, colour=BLUE)]
     caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
     x = Axis("factor from the first study to the second", log=True)

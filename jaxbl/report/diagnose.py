@@ -1,33 +1,44 @@
 """What `jaxbl diagnose` leaves to be read: missing effects, their probability, and model errors before and after."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
+from jaxbl.diagnosis.localise import Coordinate, Localised
+from jaxbl.diagnosis.residuals import Residual, narrow
+from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
+from jaxbl.records.least_squares import rms
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .motor_alone_figures import draw_motor_alone
 from .numbers import lead_with_doubt, number_table, write_fit
 from .panels import (
     BLUE,
+    MISSING,
     ORANGE,
+    SIDE_COLOURS,
     TIME,
     VERMILION,
     Axis,
+    Band,
     Figure,
+    Line,
     Panel,
+    Part,
     Span,
+    cloud,
+    intervals,
     missing_label,
-    stack,
+    with_unit,
 )
-from .residuals import draw_residual, torque_parts
 
 _BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
@@ -61,14 +72,13 @@ _FAR = 10.0
 def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     """Errors of torque and position on held-out data, and the least certain effect with its first number."""
     gap, figures = summary["gap"], []
-    before, after, noise = (gap[key] for key in ("holdout_rmse_before", "holdout_rmse_after", "noise_floor"))
+    errors = _errors_of_channels(gap)
     for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
-        if there := [name for name in channels if name in before]:
-            name = max(there, key=lambda name: _ratio(before[name], noise[name]))
-            change = f"{rms_text(before[name])} → {rms_text(after[name])} {gap['units'][name]}"
-            figures.append(
-                KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (noise {rms_text(noise[name])})")
-            )
+        if there := [name for name in channels if name in errors]:
+            name = max(there, key=lambda name: _ratio(errors[name][0], errors[name][2]))
+            before, after, noise, _ = errors[name]
+            change = f"{rms_text(before)} → {rms_text(after)} {gap['units'][name]}"
+            figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (noise {rms_text(noise)})"))
     if summary["findings"]:
         finding = min(summary["findings"], key=lambda finding: finding["confidence"])
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
@@ -244,12 +254,11 @@ def _failed_checks(summary: JsonObject) -> Lines:
 
 def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
     """Return of each channel the failed test that shows it best, its error and limit."""
-    tested = {name: (torque["after"], torque["limit"]) for name, torque in gap.get("slow_torques", {}).items()}
-    tested |= {name: (gap["holdout_rmse_after"][name], error["limit"]) for name, error in gap["expected"].items()}
-    best = dict[str, str]()
-    for name in sorted(gap["test"]["failed"], key=lambda name: _ratio(*tested[name]), reverse=True):
-        best.setdefault(name.split()[0], name)
-    return [(name, *tested[name]) for name in best.values()]
+    errors, best = _errors_of_channels(gap), dict[str, tuple[str, Any, Any]]()
+    tests = [(name, errors[name][1], errors[name][3]) for name in gap["test"]["failed"]]
+    for test in sorted(tests, key=lambda test: _ratio(*test[1:]), reverse=True):
+        best.setdefault(test[0].split()[0], test)
+    return [*best.values()]
 
 
 def probability(value: float) -> str:
@@ -294,16 +303,22 @@ def _history_table(summary: JsonObject) -> ResultTable:
     return ResultTable("How the name was found", head, rows)
 
 
-def _gap_table(gap: JsonObject) -> ResultTable:
-    units, limits = gap["units"], {name: error["limit"] for name, error in gap["expected"].items()}
-    rows: list[list[Any]] = [
-        [_CHANNELS[name], units[name], before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], limits.get(name)]
+def _errors_of_channels(gap: JsonObject) -> dict[str, list[Any]]:
+    """Held-out error before and after, noise, and the limit of a complete model, of each channel, and of slow torques."""
+    expected = gap["expected"]
+    errors = {
+        name: [before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], expected.get(name, {}).get("limit")]
         for name, before in gap["holdout_rmse_before"].items()
-    ]
-    for name, torque in gap.get("slow_torques", {}).items():
-        channel, _, below = name.partition(" ")
-        numbers = (torque[key] for key in ("before", "after", "noise", "limit"))
-        rows.append([f"{_CHANNELS[channel]}, {below}", units[channel], *numbers])
+    }
+    slow = gap.get("slow_torques", {}).items()
+    return errors | {name: [torque[key] for key in ("before", "after", "noise", "limit")] for name, torque in slow}
+
+
+def _gap_table(gap: JsonObject) -> ResultTable:
+    rows = []
+    for name, numbers in _errors_of_channels(gap).items():
+        channel, *below = name.split(maxsplit=1)
+        rows.append([", ".join([_CHANNELS[channel], *below]), gap["units"][channel], *numbers])
     head = ["channel", "unit", "before", "after", "noise", "complete model at most"]
     return ResultTable("Held-out data, rms", head, rows)
 
@@ -334,4 +349,61 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
         f"{lead}orque that the model lacks, as given and with the missing effects added, after the low-pass that shows it "
         "most clearly. A complete model stays within the grey band."
     )
-    return stack("before_after", panels, caption, 2.4)
+    return Figure("before_after", panels, caption, height=2.4)
+
+
+_SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
+_PANELS = 3
+"""Coordinates that are drawn: as many as are wide enough side by side."""
+
+
+def torque_parts(residual: Residual, bandwidth: float, name: str, *, noise: bool = True, **how: Any) -> list[Part]:
+    """A residual over time behind the low-pass that the analysis used, and its noise as a band."""
+    low, _ = narrow(residual, bandwidth)
+    band = [Band(low.time, -2.0 * low.deviation, 2.0 * low.deviation, "± 2 noise", MISSING, 0.75)]
+    return [*band * noise, Line(low.time, low.torque, name, **how)]
+
+
+def draw_residual(
+    parts: Sequence[Residual], coordinates: Sequence[Mapping[str, CoordinateValues]], located: Localised, unit: str
+) -> Figure:
+    """Draw the residual torque of a side over the coordinates that explain most of it.
+
+    Args:
+        parts: of the record.
+        coordinates: of each part, by name.
+        located: what was found of these torques.
+        unit: theirs.
+    """
+    by_name = located.coordinates
+    names = [name for name in _SHOWN if name in by_name]
+    # those that explain most, speed always
+    drawn = sorted(names, key=lambda name: (name != "speed", -by_name[name].explained))[:_PANELS]
+    lows, rows = zip(*(narrow(part, located.bandwidth) for part in parts), strict=True)
+    torque = np.concatenate([low.torque for low in lows])
+    noise = rms(np.concatenate([low.deviation for low in lows]))
+    limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
+    y, panels = Axis(missing_label(f"{located.name}: ", unit), ends=(-limit, limit)), []
+    for name in sorted(drawn, key=names.index):
+        coordinate = by_name[name]
+        values = np.concatenate([part[name].values[row] for part, row in zip(coordinates, rows, strict=True)])
+        band = Span(-2.0 * noise, 2.0 * noise, "± 2 noise", MISSING, "y", 0.6)
+        dots = cloud(values, torque, colour=SIDE_COLOURS[located.name])
+        x = Axis(with_unit(f"{name} {coordinate.symbol}".rstrip(), coordinate.unit))
+        panels.append(Panel(x, y, [band, dots, *_means(coordinate)], f"explains {100.0 * coordinate.explained:.0f} %"))
+    sentence = sentence_of(located, unit)
+    caption = (
+        f"{sentence[:1].upper()}{sentence[1:]}. Dots are samples, marks with strokes the means of bins "
+        "with twice their standard errors; hollow where a mean does not differ significantly from zero. Above: share of the "
+        "power beyond the noise that a function of this coordinate alone explains, on data that it was not fitted to."
+    )
+    return Figure(f"residual_{located.name}", panels, caption, len(panels), max(3.2 * len(panels), 4.4))
+
+
+def _means(coordinate: Coordinate) -> list[Line]:
+    rows = [(0.5 * (bin_.low + bin_.high), bin_.mean, bin_.mean_error, bin_.mean_z) for bin_ in coordinate.regions]  # pyright: ignore
+    x, y, error, z = np.array(rows).reshape(-1, 4).T
+    ends, points = intervals(x, y - 2.0 * error, y, y + 2.0 * error, "bin mean", upright=True, size=4.0)
+    unsure = np.abs(z) <= 3.0
+    hollow = points._replace(x=x[unsure], y=y[unsure], name="", fill="#FFFFFF")
+    return [Line(x, y, width=1.0, opacity=0.7), ends, points, hollow]

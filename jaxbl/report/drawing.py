@@ -3,7 +3,6 @@
 import base64
 import contextlib
 import itertools
-import math
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,7 @@ from matplotlib.layout_engine import TightLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from jaxbl.json_types import JsonObject
 
@@ -160,26 +159,24 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     below = dict(itertools.chain(*(handles.items() for handles in names)))
     if not scales and len(below) > max(map(len, names)) and not any(panel.x.ratio for panel in panels):
         below = {}
-    fit = _count_columns(below, figure.width)
-    foot = _ROW * math.ceil(len(below) / fit) + 0.1 if below else 0.0
+    fit, height = _size_legend(below, figure.width)
+    foot = height + 0.1 if below else 0.0
     canvas = Canvas(figsize=(figure.width, figure.height * rows + foot), layout="none")  # pyright: ignore[reportArgumentType]
     grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*[1.0] * columns, *[0.035 * columns] * shared])
     axes: list[Axes] = []
     axes_by_axis: dict[tuple[str, Axis], Axes] = {}
     for i, panel in enumerate(panels):
-        how = {
-            f"share{name}": axes_by_axis.get((name, axis)) for name, axis in zip("xy", panel[:2], strict=True) if axis.label
-        }
+        how = {f"share{name}": axes_by_axis.get((name, axis)) for name, axis in panel.axes.items() if axis.label}
         ax = canvas.add_subplot(grid[i // columns, i % columns], **how)
-        axes_by_axis |= {("x", panel.x): ax, ("y", panel.y): ax}
+        axes_by_axis |= dict.fromkeys(panel.axes.items(), ax)
         axes.append(ax)
         _draw_panel(ax, panel)
         above = 0.0 if below else _legend_above(ax, names[i], figure.width / columns)
         ax.set_title(_plain(panel.title), loc="left", pad=6.0 + 72.0 * above)
-        inner = {"x": i + columns < len(panels) and panels[i + columns].x == panel.x,
-                 "y": i % columns > 0 and panels[i - 1].y == panel.y}  # fmt: skip
-        for name, is_inner in inner.items():
-            if is_inner and getattr(panel, name).label:
+        # the panels below and on the left, on which the same axis stands
+        neighbours = {"x": panels[i + columns :][:1], "y": panels[i - 1 : i] if i % columns else ()}
+        for name, axis in panel.axes.items():
+            if axis.label and any(neighbour.axes[name] == axis for neighbour in neighbours[name]):
                 ax.tick_params(axis=name, labelbottom=False, labelleft=False)  # type: ignore[arg-type]
                 ax.set(**{f"{name}label": ""})
         if not shared:
@@ -205,18 +202,19 @@ def _plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _count_columns(handles: dict[str, Any], width: float) -> int:
-    return max(min(int(width / (_LETTER * max(map(len, handles), default=1) + _KEY)), len(handles)), 1)
+def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
+    """Columns of a legend, and its height, inches."""
+    fit = max(min(int(width / (_LETTER * max(map(len, handles), default=1) + _KEY)), len(handles)), 1)
+    return fit, _ROW * -(-len(handles) // fit)
 
 
 def _legend_above(ax: Axes, handles: dict[str, Any], width: float) -> float:
     """Draw a legend above the axes, where it hides no line. Returns its height, inches."""
-    if not handles:
-        return 0.0
-    fit = _count_columns(handles, width - 0.6)
+    fit, height = _size_legend(handles, width - 0.6)
     place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
-    ax.legend(handles.values(), map(_plain, handles), ncols=fit, **place)
-    return _ROW * math.ceil(len(handles) / fit)
+    if handles:
+        ax.legend(handles.values(), map(_plain, handles), ncols=fit, **place)
+    return height
 
 
 def _draw_bar(canvas: Canvas, scale: Scale, **where: Any) -> None:
@@ -233,15 +231,15 @@ def _norm(scale: Scale) -> Normalize:
 
 
 def _set_log_ticks(axis: Any, low: float, high: float) -> None:
-    axis.set_major_locator(FixedLocator(round_ticks(low, high)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: tick_text(value)))
+    places = round_ticks(low, high)
+    axis.set_ticks(places, map(tick_text, places))
     # the many small ticks take longer than all else in a figure
-    axis.set_minor_locator(NullLocator())
+    axis.set_ticks([], minor=True)
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     """Draw the parts of a panel, and set up its axes."""
-    for name, axis in zip("xy", panel[:2], strict=True):
+    for name, axis in panel.axes.items():
         ax.set(**{f"{name}label": _plain(axis.label), f"{name}scale": "log" if axis.log else "linear"})
         if axis.ends is not None:
             ax.set(**{f"{name}lim": axis.ends})
@@ -253,12 +251,12 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
     _name_lines(ax, [part for part in panel.parts if isinstance(part, Line) and part.at_line])
     ax.grid(not any(isinstance(part, Map) for part in panel.parts))
-    for name, axis in zip("xy", panel[:2], strict=True):
+    for name, axis in panel.axes.items():
         drawn = getattr(ax, f"{name}axis")
         if axis.names:
             places, texts = zip(*axis.names, strict=True)
-            ax.set(**{f"{name}ticks": places, f"{name}ticklabels": map(_plain, texts)})
-            ax.grid(axis=name, visible=False)  # type: ignore[arg-type]
+            drawn.set_ticks(places, map(_plain, texts))
+            drawn.grid(False)
         elif axis.log:
             _set_log_ticks(drawn, *getattr(ax, f"get_{name}lim")())
         else:
@@ -269,8 +267,9 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
 
 def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
     """Draw the second scale of an axis, on the top or on the right."""
-    add = {"x": partial(ax.secondary_xaxis, "top"), "y": partial(ax.secondary_yaxis, "right")}[name]
-    axis = getattr(add(functions=(partial(np.multiply, 1.0 / unit), partial(np.multiply, unit))), f"{name}axis")
+    scales = partial(np.multiply, 1.0 / unit), partial(np.multiply, unit)
+    second = getattr(ax, f"secondary_{name}axis")({"x": "top", "y": "right"}[name], functions=scales)
+    axis = getattr(second, f"{name}axis")
     axis.set_label_text(label)
     low, high = getattr(ax, f"get_{name}lim")()
     _set_log_ticks(axis, low / unit, high / unit)
@@ -338,22 +337,19 @@ def _draw_band(ax: Axes, band: Band, layer: float) -> None:
 
 
 def _draw_span(ax: Axes, span: Span, layer: float) -> None:
+    lines, areas = (ax.axvline, ax.axvspan) if span.along == "x" else (ax.axhline, ax.axhspan)
     if span.low == span.high:
-        across = ax.axvline if span.along == "x" else ax.axhline
-        across(span.low, color=span.colour, lw=span.width, ls=span.dashes, zorder=layer)
+        lines(span.low, color=span.colour, lw=span.width, ls=span.dashes, zorder=layer)
     else:
-        across = ax.axvspan if span.along == "x" else ax.axhspan
-        across(span.low, span.high, color=span.colour, alpha=span.opacity, lw=0.0, zorder=layer)
+        areas(span.low, span.high, color=span.colour, alpha=span.opacity, lw=0.0, zorder=layer)
 
 
 def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
     how: Any = {"rasterized": True, "zorder": layer}
-    values = np.asarray(cells.values, float)
-    if cells.failed is not None:
-        values = np.where(cells.failed, np.nan, values)
-        if np.any(cells.failed):
-            grey = np.where(cells.failed, 0.0, np.nan)
-            ax.pcolormesh(cells.x, cells.y, grey, cmap=ListedColormap([MISSING]), **how)
+    values = np.where(cells.failed, np.nan, cells.values)
+    if np.any(cells.failed):
+        grey = np.where(cells.failed, 0.0, np.nan)
+        ax.pcolormesh(cells.x, cells.y, grey, cmap=ListedColormap([MISSING]), **how)
     ax.pcolormesh(cells.x, cells.y, values, cmap=cells.scale.colours, norm=_norm(cells.scale), **how)
 
 
@@ -370,15 +366,13 @@ def _legend_handles(panel: Panel) -> dict[str, Any]:
     """The legend's handle of each name in a panel that does not stand beside its line."""
     handles: dict[str, Any] = {}
     for part in panel.parts:
-        name = getattr(part, "name", "")
-        if isinstance(part, Map) and not np.any(part.failed):
-            continue
-        if not name or name in handles or (isinstance(part, Line) and part.at_line):
+        is_hidden = part.at_line if isinstance(part, Line) else isinstance(part, Map) and not np.any(part.failed)
+        if is_hidden or not part.name or part.name in handles:
             continue
         if isinstance(part, Line):
-            handles[name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
+            handles[part.name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
         elif isinstance(part, Span) and part.low == part.high:
-            handles[name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
+            handles[part.name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
         else:
-            handles[name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
+            handles[part.name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
     return handles

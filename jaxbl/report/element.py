@@ -11,7 +11,7 @@ from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
 from .numbers import lead_with_doubt, number_figures, number_table, write_fit
-from .panels import BLUE, ORANGE, TIME, Axis, Figure, Line, Panel, Part, Span, cloud, join, missing_quantity, stack
+from .panels import BLUE, ORANGE, Axis, Figure, Panel, Span, cloud, draw_signals, missing_quantity
 
 
 def write(result: ElementIdentification, folder: Path) -> str:
@@ -58,17 +58,15 @@ def draw(result: ElementIdentification) -> list[Figure]:
     trace, record, numbers = result.trace, result.task.record, result.element.numbers
     unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))
     time, x, u, fitted = (trace[name].to_numpy() for name in ("t", "displacement", "u", "torque"))
-    parts: list[Part] = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)]
+    parts, gap = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)], []
     if {"half_gap", "centre"} <= numbers.keys():
         middle, half = numbers["centre"].value, numbers["half_gap"].value
-        parts.append(Span(middle - half, middle + half, "gap", ORANGE))
-    loop = Panel(Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})"), parts)
-    time, *signals = join(time, record.segments, u, u - fitted)
-    panels = [
-        Panel(TIME, Axis(f"{label}\n({torque_unit})"), [Line(time, signal, colour=BLUE, width=0.9)])
-        for signal, label in zip(signals, ("torque", "not explained"), strict=True)
-    ]
+        gap = [Span(middle - half, middle + half, "gap", ORANGE)]
+    axes = Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})")
+    loop = Panel(*axes, [*parts, *gap])
+    signals = (u, "torque", torque_unit, BLUE), (u - fitted, "not explained", torque_unit, BLUE)
+    panels = draw_signals(time, record.segments, signals)
     return [
         Figure("loop", [loop], "Torque over displacement: as measured, and of the transmission that was found."),
-        stack("residual", panels, "The torque over time, and what of it is not explained."),
+        Figure("residual", panels, "The torque over time, and what of it is not explained.", height=1.7),
     ]

@@ -40,8 +40,8 @@ def condition_curves(conditions: Mapping[str, Condition], bound: float, alphas: 
             x, y = y, x
         dashes, colour = _LOOKS[name]
         # named where it is drawn; a dark line beneath parts it from any colour
-        curves.append(Line(x, y, colour="#222222", width=3.4))
-        curves.append(Line(x, y, condition.title, colour, 2.0, dashes, at_line=True))
+        beneath = Line(x, y, colour="#222222", width=3.4)
+        curves += beneath, Line(x, y, condition.title, colour, 2.0, dashes, at_line=True)
     return curves
 
 

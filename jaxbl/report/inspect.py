@@ -17,22 +17,17 @@ from .panels import (
     COLOURS,
     GREEN,
     PURPLE,
-    TIME,
     VERMILION,
     Axis,
     Figure,
-    Line,
     Panel,
     cloud,
-    join,
-    stack,
+    draw_signals,
 )
 
-_CHANNELS = {
-    "u": ("input u", BLACK), "theta_e": ("motor θe", BLUE), "theta_s": ("load θs", VERMILION),
-    "transmitted": ("transmitted", GREEN),
-}  # fmt: skip
-"""Label and colour of each channel."""
+_LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
+_COLOURS = {"u": BLACK, "theta_e": BLUE, "theta_s": VERMILION, "transmitted": GREEN}
+"""Of channels."""
 
 
 def write(inspection: Inspection, folder: Path) -> str:
@@ -43,20 +38,18 @@ def write(inspection: Inspection, folder: Path) -> str:
 
 def describe(inspection: Inspection) -> Result:
     """Say what the log can identify, and what is wrong with it."""
-    record, by_answer = inspection.record, {}
+    record = inspection.record
     judgements = [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
-    for quantity, answer, _ in judgements:
-        by_answer.setdefault(answer, []).append(quantity)
-    parts = [
-        f"{lead} {', '.join(by_answer[answer])}"
-        for answer, lead in (("yes", "shows"), ("weak", "hardly shows"), ("no", "does not show"))
-        if answer in by_answer
-    ]
-    verdict = "good" if "yes" in by_answer else "doubtful" if by_answer.keys() - {"no"} else "no answer"
+    parts, verdict = [], "no answer"
+    # the best answer last: it decides
+    for answer, lead, word in _ANSWERS:
+        if quantities := [quantity for quantity, judged, _ in judgements if judged == answer]:
+            parts.insert(0, f"{lead} {', '.join(quantities)}")
+            verdict = word
     sampling = record.statistics.sampling
     stamps = "even stamps" if sampling.even else f"uneven stamps (jitter {1e3 * sampling.jitter:.2g} ms rms)"
     count = len(record.segments)
-    span = float(sum(np.ptp(record.time[part]) for part in record.segments)) + count * record.sample_period
+    span = sum(np.ptp(record.time[part]) for part in record.segments) + count * record.sample_period
     samples = f"{len(record.time)} samples every {1e3 * record.sample_period:.5g} ms, {stamps}"
     figures = [KeyFigure(f"{span:.4g} s", f"{samples}, {count} segment{'s' * (count > 1)}")]
     figures += [
@@ -75,6 +68,10 @@ def describe(inspection: Inspection) -> Result:
     return lead_with_doubt(Result(record.path.name, verdict, headline, figures, remarks, record.notes, tables))
 
 
+_ANSWERS = ("no", "does not show", "no answer"), ("weak", "hardly shows", "doubtful"), ("yes", "shows", "good")
+"""What a log can say of a quantity, in words, and the verdict if that is the best of its answers."""
+
+
 def _channel_table(record: Record) -> ResultTable:
     columns = ["channel", "unit", "least", "largest", "resolution", "noise", "bandwidth (Hz)", "saturated (share)", "jumps",
                "skew (ms)", "standard error (ms)"]  # fmt: skip
@@ -88,11 +85,7 @@ def _channel_table(record: Record) -> ResultTable:
 
 def draw(inspection: Inspection) -> list[Figure]:
     """All figures of an inspected log."""
-    record = inspection.record
-    figures = [_channels(record)]
-    if inspection.twist is not None:
-        figures.append(_twist(inspection))
-    return figures
+    return [_channels(inspection.record), *([] if inspection.twist is None else [_twist(inspection)])]
 
 
 def _values(record: Record) -> dict[str, np.ndarray]:
@@ -103,16 +96,11 @@ def _values(record: Record) -> dict[str, np.ndarray]:
 
 def _channels(record: Record) -> Figure:
     side, channels = main_side(record), record.statistics.channels
-    signals = [(signal, *_CHANNELS[name], channels[name].unit) for name, signal in _values(record).items()]
+    signals = [(signal, _LABELS[name], channels[name].unit, _COLOURS[name]) for name, signal in _values(record).items()]
     unit = f"{channels[POSITION_CHANNELS[side]].unit}/s"
-    signals.append((compute_velocity(record, side), f"{side} velocity", PURPLE, unit))
-    time, *joined = join(record.time, record.segments, *(signal for signal, *_ in signals))
-    panels = [
-        Panel(TIME, Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
-        for values, (_, label, colour, unit) in zip(joined, signals, strict=True)
-    ]
+    signals.append((compute_velocity(record, side), f"{side} velocity", unit, PURPLE))
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
-    return stack("channels", panels, caption, 1.5)
+    return Figure("channels", draw_signals(record.time, record.segments, signals), caption, height=1.5)
 
 
 def _twist(inspection: Inspection) -> Figure:
@@ -123,8 +111,8 @@ def _twist(inspection: Inspection) -> Figure:
     name = "u" if record.transmitted is None else "transmitted"
     torque = _values(record).get(name)
     if torque is not None and np.ptp(torque):
-        over.insert(0, (torque, f"{_CHANNELS[name][0]} ({channels[name].unit})"))
-    rows = np.concatenate([np.arange(part.start, part.stop) for part in record.segments])
+        over.insert(0, (torque, f"{_LABELS[name]} ({channels[name].unit})"))
+    rows = np.r_[*record.segments]
     if gearing is not None and gearing.flank == "load":
         split, names = "the side that the load pulls to", ("load on its first side", "on the other")
         chosen = np.searchsorted(gearing.flank_times, record.time[rows]) % 2 == 0

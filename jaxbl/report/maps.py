@@ -41,7 +41,7 @@ from .panels import (
     mark,
     with_unit,
 )
-from .refined_maps import Filling, on_coarse_values
+from .refined_maps import Filling, coarse_axes, on_coarse_values
 
 
 def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
@@ -51,12 +51,10 @@ def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
     if not varying:
         return []
     value = min((name for name in columns if name.startswith("motor.")), key=lambda name: name != "motor.velocity_rmse")
-    *facets, x = (axis.path for axis in varying[-3:])
-    if not facets:
-        return [FigureTable(kind="line", x=x, value=value)]
-    y = facets.pop()
-    facet = facets[0] if facets and values_of(config, varying[-3]) <= MOST_PARTS else None
-    return [FigureTable(kind="heatmap", x=x, y=y, value=value, facet=facet)]
+    paths = {key: axis.path for key, axis in zip(("x", "y", "facet"), reversed(varying), strict=False)}
+    if "facet" in paths and values_of(config, varying[-3]) > MOST_PARTS:
+        del paths["facet"]
+    return [FigureTable(kind="heatmap" if "y" in paths else "line", value=value, **paths)]
 
 
 laws_of = lru_cache(maxsize=1)(accuracy_laws)
@@ -72,9 +70,10 @@ def draw(result: StudyResult) -> list[Figure]:
     config = result.config
     specs = config.figures or default_figures(config, result.columns)
     check_figures(config, specs, result.columns)
-    points = Points(config) if config.sweep.refine is not None else None
+    points = Points(config)
     figures: list[Figure] = []
     runs = sum(map(len, result.batches(["seed"]))) if specs else 0
+    unfinished = "" if result.is_finished(runs) else f" The study is not finished: {runs} runs so far, white where none is."
     for i, spec in enumerate(specs):
         if spec.theory is not None:
             panels, caption = _laws(config, spec, [law for law in laws_of(result) if law.figure == i])
@@ -82,30 +81,27 @@ def draw(result: StudyResult) -> list[Figure]:
             panels, caption = _heatmap(config, _rows(result, spec, points), spec, points)
         else:
             panels, caption = _lines(config, _rows(result, spec, points), spec)
-        caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}"
-        if not result.is_finished(runs):
-            caption += f" The study is not finished: {runs} runs so far, white where none is."
+        caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}{unfinished}"
         name = re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{spec.value}").strip("_")
         same = sum(earlier.name.partition("-")[0] == name for earlier in figures)
         columns = arrange(len(panels))
-        size: Any = {"width": 3.4 * columns + 0.6, "height": 3.0} if len(panels) > 1 else {"width": 5.6, "height": 4.0}
-        figures.append(Figure(f"{name}-{same + 1}" if same else name, panels, caption, columns, **size))
+        size = (3.4 * columns + 0.6, 3.0) if len(panels) > 1 else (5.6, 4.0)
+        figures.append(Figure(f"{name}-{same + 1}" if same else name, panels, caption, columns, *size))
     return figures
 
 
-def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Rows:
+def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     """The rows that a figure shows, with the columns that it needs; of a quasi-random design at the middles of bins."""
     config = result.config
-    metrics = {f"{side}.{name}" for side in config.sides for name in ("converged", "f_plus", "margin_alpha")}
-    metrics |= {figure.value, "finite"}
-    columns = [*config.axis_paths, "seed", *(name for name in result.columns if name in metrics)]
+    names = "finite", "converged", "f_plus", "margin_alpha"
+    metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
+    columns = [*config.axis_paths, "seed", *metrics]
     random = [axis for axis in config.axes if axis.path in (figure.x, figure.y) and axis.values is None and axis.num is None]
     # about four points in each bin of a map
     bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))
 
     def select(frame: DataFrame) -> DataFrame:
-        if points is not None:
-            frame = on_coarse_values(points, frame, [figure.x, figure.y])
+        frame = on_coarse_values(points, frame, [figure.x, figure.y])
         frame = filter_rows(frame, resolve_where(config, figure))
         for axis in random:
             middles = axis.model_copy(update={"num": 2 * bins + 1}).grid()[1::2]
@@ -113,7 +109,7 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points | None) -> Ro
             frame = frame.assign(**{axis.path: middles[np.searchsorted(edges, frame[axis.path])]})
         return frame
 
-    needs = [*(figure.where or {}), *(axis.path for axis in random), *([] if points is None else columns)]
+    needs = [*(figure.where or {}), *(axis.path for axis in random), *(columns if points.refinement else ())]
     return Rows(result, columns, select, needs)
 
 
@@ -140,11 +136,11 @@ def axis_label(config: Config, path: str) -> str:
     return with_unit(path_words(config, path), unit_of(config, path))
 
 
-def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -> Axis:
-    """An axis of a figure that shows the cells about some values of a study's axis."""
+def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -> tuple[Axis, Array]:
+    """An axis of a figure that shows the cells about some values of a study's axis, and their edges."""
     log = is_log(config, path, values) if log is None else log
-    low, *_, high = map(float, cell_edges(values, log))
-    return Axis(axis_label(config, path), path, log, (low, high))
+    edges = cell_edges(values, log)
+    return Axis(axis_label(config, path), path, log, (float(edges[0]), float(edges[-1]))), edges
 
 
 def axis_words(config: Config, path: str) -> dict[str, str]:
@@ -167,8 +163,9 @@ def with_value(config: Config, path: str, value: Any) -> str:
     return f"{path_words(config, path)} {text}"
 
 
-def _panel_title(config: Config, spec: FigureTable, value: Any) -> str:
-    return "" if spec.facet is None else with_value(config, spec.facet, value)
+def _part_name(config: Config, path: str | None, value: Any) -> str:
+    """Words for the value that a panel or a line is of; "" where there is one alone."""
+    return "" if path is None else with_value(config, path, value)
 
 
 def _text(value: Any) -> str:
@@ -202,7 +199,7 @@ def flat_remark(values: Array) -> str:
     return f"flat: within {100 * AS_GOOD:g} %" if is_flat else ""
 
 
-def colour_scale(values: Array, label: str, scale: str = "auto") -> Scale:
+def colour_scale(values: Array, label: str, scale: str) -> Scale:
     """Colours of values: logarithmic where they are positive and span more than a factor of 30, one colour where they are
     flat."""
     finite = values[np.isfinite(values)]
@@ -221,11 +218,10 @@ def cell_edges(centres: Array, log: bool) -> Array:
     """Cell edges halfway between centres, in the axis's own scale."""
     points = np.log(centres) if log else centres
     if len(points) == 1:
-        half = 0.5 if log else 0.5 * (abs(points[0]) or 1.0)
-        edges = points[0] + np.array([-half, half])
+        edges = points + np.array([-0.5, 0.5]) * (1.0 if log else abs(points[0]) or 1.0)
     else:
         middle = 0.5 * (points[1:] + points[:-1])
-        edges = np.concatenate([[2 * points[0] - middle[0]], middle, [2 * points[-1] - middle[-1]]])
+        edges = np.concatenate([2 * points[:1] - middle[:1], middle, 2 * points[-1:] - middle[-1:]])
     return np.exp(edges) if log else edges
 
 
@@ -238,46 +234,41 @@ def is_log(config: Config, path: str, values: Array) -> bool:
     return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
 
 
-def _split(table: Any, spec: FigureTable) -> list[tuple[Any, Any]]:
-    """The value of each panel, and the panel's part of a table or of rows; None and all where there is one panel."""
-    if spec.facet is None:
+def _split(table: Any, path: str | None) -> list[tuple[Any, Any]]:
+    """The value of each panel or line, and its part of a table or of rows; None and all where there is one alone."""
+    if path is None:
         return [(None, table)]
-    parts = table.groupby(spec.facet, sort=True)
-    return [(value, part.droplevel(0) if spec.facet in part.index.names else part) for value, part in parts]
+    parts = table.groupby(path, sort=True)
+    return [(value, part.droplevel(0) if path in part.index.names else part) for value, part in parts]
 
 
-def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points | None) -> Series:
+def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Series:
     """The f_plus that conditions are drawn for: by panel, the median of the true bounds of its converged points, or of all
     if none did."""
     side = spec.x.split(".")[1]
-    converged, bound = f"{side}.converged", f"{side}.f_plus"
-    paths = [] if points is None or points.refinement is None else points.refinement.paths
+    # most points of a refined study lie at its boundary: the median is that of the coarse grid
+    bounds = Column(
+        [f"{side}.converged", f"{side}.f_plus", "seed", *coarse_axes(points)],
+        lambda frame: frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame)),
+    )
+    converged = bounds._replace(of=lambda frame: bounds.of(frame).where(frame[f"{side}.converged"].astype(bool)))
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
-
-    def medians(converged_alone: bool) -> Series:
-        def read(frame: DataFrame) -> Series:
-            # most points of a refined study lie at its boundary: the median is that of the coarse grid
-            there = frame[converged].astype(bool) | (not converged_alone)
-            return frame[bound].where(there if points is None else there & points.on_coarse_grid(frame))
-
-        return groups.medians(Column([converged, bound, *paths], read))
-
-    bounds = medians(True)
-    return bounds.fillna(medians(False)) if bounds.isna().any() else bounds
+    medians = groups.medians(converged)
+    return medians.fillna(groups.medians(bounds)) if medians.isna().any() else medians
 
 
-def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | None) -> tuple[list[Panel], str]:
-    """A map; with `points` of a refined study, those that were not simulated show the nearest that was."""
+def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> tuple[list[Panel], str]:
+    """A map; points of a refined study that were not simulated show the nearest that was."""
     assert spec.y is not None
     side, paths, axes = spec.value.partition(".")[0], config.axis_paths, (spec.x, spec.y)
     keys = [path for path in (spec.facet, spec.y, spec.x) if path is not None]
     simulated = groups = Groups(rows, keys, paths)
     filling, filled = None, rows
-    if points is not None:
+    if points.refinement is not None:
         # a refined study has its points for their places: all of them are filled
         filling = Filling(points, rows.frame, *axes)
         unseen = [path for path in paths if path not in keys]
-        filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec)]
+        filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec.facet)]
         groups = Groups(filled, keys, paths)
     table, converged = _map_table(groups, next(iter(filled)), spec.value), f"{side}.converged"
     bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
@@ -285,20 +276,22 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | Non
     if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
         # of a refined study those that were simulated
         has_margin = f"{side}.margin_alpha" in next(iter(filled))
-        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec))
-    scale = colour_scale(table["value"][~table["failed"]].to_numpy(float), value_label(spec.value), spec.scale)
+        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec.facet))
+    # what failed sets no colour
+    table["shown"] = table["value"].where(~table["failed"])
+    scale = colour_scale(table["shown"].to_numpy(float), value_label(spec.value), spec.scale)
     if is_boolean(spec.value):
         scale = scale._replace(low=0.0, high=1.0, log=False)
     failure, drawn = _failure_name(table[table["failed"]], spec.value), []
-    for i, (value, part) in enumerate(_split(table, spec)):
-        *centres, grid = _dense(part["value"], filling)
-        *_, failed = _dense(part["failed"].astype(float), filling)
+    for i, (value, part) in enumerate(_split(table, spec.facet)):
+        plane = part[["value", "failed"]].astype(float)
         # what an unfinished study has not computed yet stays white
-        failed = failed > 0.5 if filling is None else (failed > 0.5) | np.isnan(grid)
-        x, y = (axis_of(config, *axis) for axis in zip(axes, centres, strict=True))
-        edges = (cell_edges(values, axis.log) for values, axis in zip(centres, (x, y), strict=True))
-        parts: list[Part] = [Map(*edges, grid, scale, failed, failure)]
-        under = [flat_remark(part["value"][~part["failed"]].to_numpy(float))]
+        plane = plane if filling is None else filling.fill(plane).fillna({"failed": 1.0})
+        grid, failed = (plane[name].unstack() for name in plane)
+        centres = (index.to_numpy(float) for index in (grid.columns, grid.index))
+        (x, x_edges), (y, y_edges) = (axis_of(config, *axis) for axis in zip(axes, centres, strict=True))
+        parts: list[Part] = [Map(x_edges, y_edges, grid.to_numpy(), scale, failed.to_numpy() > 0.5, failure)]
+        under = [flat_remark(part["shown"].to_numpy(float))]
         if errors and (best := best_gains(errors[value])):
             place = errors[value].index[best.index]
             parts.append(mark(*place[::-1], "best", size=13.0))
@@ -308,7 +301,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points | Non
             alphas = (x if alpha_is_x else y).ends
             parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {bound:.3g} rad/s²")
-        title = "\n".join(filter(None, (_panel_title(config, spec, value), ",  ".join(filter(None, under)))))
+        title = "\n".join(filter(None, (_part_name(config, spec.facet, value), ",  ".join(filter(None, under)))))
         drawn.append(Panel(x, y, parts, title))
     return drawn, f" and {path_words(config, spec.y)}{_over(config, groups.varied, spec)}."
 
@@ -333,14 +326,6 @@ def _failure_name(failures: DataFrame, value: str) -> str:
     converges = f"{value.partition('.')[0]}.converged" in failures or "time" in value
     word = "diverged" if (failures["finite"] < 1.0).all() else "not converged" if converges else "undefined"
     return f"{word} ({len(failures)} points)" if len(failures) else ""
-
-
-def _dense(table: Series, filling: Filling | None) -> tuple[Array, Array, Array]:
-    """Values of x `(columns,)` and y `(rows,)`, and a table over (y, x) as a matrix `(rows, columns)`."""
-    if filling is not None:
-        return filling.dense(table)
-    grid = table.unstack()
-    return grid.columns.to_numpy(float), grid.index.to_numpy(float), grid.to_numpy(float)
 
 
 def drawn_values(part: DataFrame, value: str) -> Series:
@@ -384,7 +369,7 @@ def worst_runs(groups: Groups, value: str, has_margin: bool) -> DataFrame:
 def best_gains(runs: DataFrame) -> BestGains | None:
     """The best gains (:func:`jaxbl.gains.best_gains.find_best_gains`) of :func:`worst_runs` over them."""
     return find_best_gains(
-        DataFrame({path.rpartition(".")[2]: runs.index.get_level_values(path) for path in runs.index.names}),
+        runs.index.to_frame(index=False).rename(columns=lambda path: path.rpartition(".")[2]),
         runs["error"].to_numpy(),
         (runs["converged"] == 1.0).to_numpy(),
         alpha_ratio=runs["margin_alpha"].to_numpy() if "margin_alpha" in runs else None,
@@ -402,17 +387,16 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
         table["middle"] = spread.median
     band, drawn = "", []
     scale = colour_scale(np.concatenate([spread.least, spread.largest]), value_label(spec.value), spec.scale)
-    for facet, part in _split(table.reset_index(), spec):
-        lines, parts = [(None, part)] if spec.series is None else part.groupby(spec.series, sort=True), list[Part]()
-        for i, (value, line) in enumerate(lines):
-            x, colour = line[spec.x], COLOURS[i % len(COLOURS)]
-            name = "" if value is None else with_value(config, spec.series, value)
+    for facet, part in _split(table.reset_index(), spec.facet):
+        parts = list[Part]()
+        for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
+            x, name = line[spec.x], _part_name(config, spec.series, value)
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
             parts.append(Line(x, line["middle"], name, colour, marker="o", size=3.5))
-        x = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
-        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _panel_title(config, spec, facet)))
+        x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
+        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _part_name(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
 
 
@@ -430,8 +414,10 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
                 Line(law.x_values, y, colour=colour, width=0.0, marker="o", size=3.5),
                 Line(ends, ends if law.fit is None else law.fit(ends), name, colour),
             ]
-        x = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
-        panels.append(Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _panel_title(config, spec, facet)))
+        x, _ = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
+        panels.append(
+            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _part_name(config, spec.facet, facet))
+        )
     seeds = config.sweep.seeds
     return panels, (
         f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines with their slopes: least "

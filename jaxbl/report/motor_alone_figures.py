@@ -3,7 +3,7 @@
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.estimation.identify import Identification
 
-from .panels import BLACK, BLUE, Axis, Figure, Panel, Part, cloud, limits, shade_gap
+from .panels import BLACK, BLUE, Axis, Figure, Panel, cloud, limits, shade_gap
 
 
 def draw_motor_alone(result: Identification | Diagnosis) -> Figure:
@@ -13,9 +13,9 @@ def draw_motor_alone(result: Identification | Diagnosis) -> Figure:
     ratio = float(result.model.build().plant.drive.ratio("load"))
     twist = (trace["theta_e"] - ratio * trace["load.modelled_position"]).to_numpy()
     by_motor, law = trace["torque_by_motor"].to_numpy(), trace["torque"].to_numpy()
-    parts: list[Part] = [cloud(twist, by_motor, "by the motor's side", BLUE), cloud(twist, law, "model", BLACK)]
-    if gap and (half := gap["half_gap"]):
-        parts.insert(0, shade_gap(half, f"gap: half width {half:.4g} {unit}"))
+    half = (gap and gap["half_gap"]) or 0.0
+    clouds = cloud(twist, by_motor, "by the motor's side", BLUE), cloud(twist, law, "model", BLACK)
+    parts = [*shade_gap(half, f"gap: half width {half:.4g} {unit}"), *clouds]
     x = Axis(f"twist θe − N₀ θs, the load's position by the model ({unit})", ends=limits(twist))
     return Figure(
         "hysteresis",

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pandas as pd
 import tomli_w
@@ -12,11 +12,6 @@ from jaxbl.files import to_jsonable, write_json
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.quantity import QUANTITY_COLUMNS, Quantity
 from jaxbl.result import KeyFigure, Result, ResultTable
-
-if TYPE_CHECKING:
-    from jaxbl.diagnosis.diagnose import Diagnosis
-    from jaxbl.estimation.element import ElementIdentification
-    from jaxbl.estimation.identify import Identification
 
 _FIGURES = 4
 """Numbers at the head of a page; its table has all."""
@@ -44,18 +39,20 @@ def lead_with_doubt(result: Result) -> Result:
     return replace(result, verdict="doubtful", headline=doubts[0].removeprefix(DOUBT), remarks=remarks)
 
 
-def write_fit(result: "Identification | Diagnosis | ElementIdentification", folder: Path, name: str, model: str = "") -> str:
-    """Write `name.json`, `model.toml` and `trace.parquet` into a folder that exists. Returns the model's TOML."""
+def write_fit(result: Any, folder: Path, name: str, model: str = "") -> str:
+    """Write `name.json`, `model.toml` and `trace.parquet` of a fit to a log into a folder that exists. Returns the model's
+    TOML."""
     result.trace.to_parquet(folder / "trace.parquet", index=False)
     # that of a transmission alone is given
-    model = model or format_model(result, folder / "trace.parquet")  # pyright: ignore[reportArgumentType]
+    model = model or format_model(result, folder / "trace.parquet")
     (folder / "model.toml").write_text(model, encoding="utf-8")
     write_json(folder / f"{name}.json", result.summary)
     return model
 
 
-def format_model(result: "Identification | Diagnosis", trace: Path) -> str:
-    """The fitted study as TOML, complete for a run; for want of an excitation with the torque of `trace` beside it."""
+def format_model(result: Any, trace: Path) -> str:
+    """The study of an `Identification` or a `Diagnosis` as TOML, complete for a run; for want of an excitation with the
+    torque of `trace` beside it."""
     from jaxbl.estimation.logs import run_of
     from jaxbl.gains.machine_study import complete_study
 

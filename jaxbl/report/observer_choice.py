@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import tomli_w
 
 from jaxbl.config import Config
@@ -33,7 +34,6 @@ from .panels import (
     arrange,
     intervals,
     name_rows,
-    place_words,
     tick_text,
 )
 from .tune import error_label, for_title, write_gains
@@ -42,44 +42,40 @@ from .tune import error_label, for_title, write_gains
 def draw(choice: ObserverChoice) -> list[Figure]:
     """All figures of a choice: intervals for a single point, else a map for each side."""
     summary = choice.summary
-    sides = list(summary["points"][0]["sides"])
-    if len(summary["points"]) == 1:
-        return [_ratios(summary, sides)]
-    return [_map(choice.config, summary, side) for side in sides]
+    first, *more = summary["points"]
+    return [_map(choice.config, summary, side) for side in first["sides"]] if more else [_ratios(summary)]
 
 
-def _sort_kinds(kinds: JsonObject) -> tuple[dict[str, JsonObject], list[str]]:
-    """Kinds with a ratio, best first, and names of those without."""
-    compared = {kind: result for kind, result in kinds.items() if result["ratio"] is not None}
-    return compared, [kind for kind in kinds if kind not in compared]
+_RATIO = "ratio", "low", "high"
 
 
-def _ratios(summary: JsonObject, sides: Sequence[str]) -> Figure:
+def _ratios(summary: JsonObject) -> Figure:
     """Ratios with their intervals, a panel for each side."""
     panels = []
-    for side in sides:
-        kinds = summary["points"][0]["sides"][side]["kinds"]
-        compared, lost = _sort_kinds(kinds)
-        highest = max((result["high"] for result in compared.values()), default=1.0)
-        low, ratio, high = (np.array([result[key] for result in compared.values()]) for key in ("low", "ratio", "high"))
-        texts = ["best" if i == 0 else _ratio(result) for i, result in enumerate(compared.values())]
+    for side, result in summary["points"][0]["sides"].items():
+        kinds = result["kinds"]
+        compared, lost = pd.DataFrame(kinds, _RATIO).astype(float).dropna(axis=1), _lost_kinds(kinds)
+        ratio, low, high = compared.to_numpy()
+        texts = ["best" if i == 0 else _ratio(kinds[kind]) for i, kind in enumerate(compared)]
         texts += ["diverged, or too slow"] * len(lost)
         parts: list[Part] = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
-            *intervals(range(len(compared)), low, ratio, high, colour=SIDE_COLOURS[side]),
-            place_words([*high, *[0.9] * len(lost)], range(len(kinds)), texts),
+            *intervals(range(len(high)), low, ratio, high, colour=SIDE_COLOURS[side]),
+            Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
         ]
-        x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + highest) ** 1.5))
+        x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + max(high, default=1.0)) ** 1.5))
         panels.append(Panel(x, name_rows([*compared, *lost]), parts, side))
     caption = (
         f"{error_label(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with "
         "its 95 % interval where they differ."
     )
     height = 0.9 + 0.34 * len(summary["observers"])
-    return Figure("observers", panels, caption, len(sides), 5.2 * len(sides), height)
+    return Figure("observers", panels, caption, len(panels), 5.2 * len(panels), height)
 
 
-_RATIO = "ratio", "low", "high"
+def _lost_kinds(kinds: JsonObject) -> list[str]:
+    """Kinds without a ratio."""
+    return [kind for kind, result in kinds.items() if result["ratio"] is None]
 
 
 def _ratio(result: JsonObject) -> str:
@@ -92,7 +88,8 @@ def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, 
     """Values of the axes that have several, in their order; of axes that advance together, those of the side's own, or of
     the first."""
     together: dict[str, list[str]] = {}
-    for axis in config.tune.axes if config.tune is not None else ():
+    assert config.tune is not None
+    for axis in config.tune.axes:
         together.setdefault(axis.zip or axis.path, []).append(axis.path)
     paths = [min(zipped, key=lambda path: f".{side}_" not in path) for zipped in together.values()]
     columns = {path: list(dict.fromkeys(point["values"][path] for point in summary["points"])) for path in paths}
@@ -132,12 +129,13 @@ def _map(config: Config, summary: JsonObject, side: str) -> Figure:
     winners = {point["best"] for point in points.values()} - {None}
     panels, columns = [], arrange(math.prod(map(len, further.values())))
     for values in product(*further.values()):
-        cells = [[points[*values, v, u] for u in xs] for v in ys]
-        best = np.array([[numbers.get(cell["best"], np.nan) for cell in row] for row in cells])
-        texts = [_cell_text(cell, short) for row in cells for cell in row]
-        place_x, place_y = (axis.ravel() for axis in np.meshgrid(*map(np.arange, best.shape[::-1])))
-        winners_map = Map(*edges, best, scale, np.isnan(best), "all diverge, or are too slow")
-        parts = [winners_map, Line(place_x, place_y, width=0.0, texts=texts)]
+        cells = [points[*values, v, u] for v in ys for u in xs]
+        best = np.array([numbers.get(cell["best"], np.nan) for cell in cells]).reshape(len(ys), len(xs))
+        rows_of_cells, columns_of_cells = np.indices(best.shape).reshape(2, -1)
+        parts = [
+            Map(*edges, best, scale, np.isnan(best), "all diverge, or are too slow"),
+            Line(columns_of_cells, rows_of_cells, width=0.0, texts=[_cell_text(cell, short) for cell in cells]),
+        ]
         title = ", ".join(with_value(config, *pair) for pair in zip(further, values, strict=True))
         panels.append(Panel(x_axis, y_axis, parts, title))
     names = ", ".join(f"{short[kind]}: {kind}" for kind in kinds if kind in winners)
@@ -168,13 +166,11 @@ def describe(choice: ObserverChoice) -> Result:
     """Say which kind of observer is best, and by how much."""
     config, summary = choice.config, choice.summary
     points, kind = summary["points"], summary.get("for_both_sides")
-    figures = []
-    for side in points[0]["sides"]:
-        best = Counter(point["sides"][side]["best"] for point in points)
-        del best[None]
-        for name, count in best.most_common(1):
-            share = f"best at {count} of {len(points)} points" if len(points) > 1 else "best"
-            figures.append(KeyFigure(name, f"{side}: {share} ({summary['objective']} error, {_where(summary)})"))
+    figures = [
+        KeyFigure(name, f"{side}: {share} ({summary['objective']} error, {_where(summary)})")
+        for side in points[0]["sides"]
+        for name, share in _best_kinds(points, side)[:1]
+    ]
     verdict, headline = "good", f"Take {kind}: gains.toml has its gains."
     if not figures:
         verdict, headline = "failed", "All kinds of observers diverge, or are too slow."
@@ -219,22 +215,28 @@ def _where(summary: JsonObject) -> str:
     return f"{input_}, {last - first + 1} seeds"
 
 
+def _best_kinds(points: Sequence[JsonObject], side: str) -> list[tuple[str, str]]:
+    """Kinds that are best somewhere on a side, the most frequent one first, and the words for where."""
+    counts = Counter(point["sides"][side]["best"] for point in points)
+    del counts[None]
+    where = " at {} of {} points" if len(points) > 1 else ""
+    return [(kind, f"best{where.format(count, len(points))}") for kind, count in counts.most_common()]
+
+
 def choice_headline(summary: JsonObject) -> Lines:
     """Which kind is best on each side, at how many points, and what fails; the table has by how much."""
-    lines = []
-    for side in summary["points"][0]["sides"]:
-        results = [point["sides"][side] for point in summary["points"]]
-        counts = Counter(result["best"] for result in results if result["best"] is not None)
-        shared = Counter(kind for result in results for kind in result["not_told_apart"])
-        kinds = [
-            f"{kind} is best at {count} of {len(results)} points" if len(results) > 1 else f"{kind} is best"
-            for kind, count in counts.most_common()
-        ]
-        line = f"{side}: {', '.join(kinds) or 'all kinds diverge, or are too slow'}"
-        if counts and shared:
-            line += f"; not told apart from the best: {', '.join(shared)}"
-        lost = dict.fromkeys(kind for result in results for kind in _sort_kinds(result["kinds"])[1])
-        lines.append(f"{line}; diverge somewhere, or are too slow: {', '.join(lost)}." if counts and lost else f"{line}.")
+    lines, points = [], summary["points"]
+    for side in points[0]["sides"]:
+        results = [point["sides"][side] for point in points]
+        kinds = [f"{kind} is {share}" for kind, share in _best_kinds(points, side)]
+        clauses = [f"{side}: {', '.join(kinds) or 'all kinds diverge, or are too slow'}"]
+        further = {
+            "not told apart from the best": [kind for result in results for kind in result["not_told_apart"]],
+            "diverge somewhere, or are too slow": [kind for result in results for kind in _lost_kinds(result["kinds"])],
+        }
+        if kinds:
+            clauses += [f"{lead}: {', '.join(dict.fromkeys(names))}" for lead, names in further.items() if names]
+        lines.append(f"{'; '.join(clauses)}.")
     return lines
 
 

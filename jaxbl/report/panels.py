@@ -4,7 +4,6 @@
 """
 
 import base64
-import itertools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -143,7 +142,7 @@ class Map(NamedTuple):
     y: Any
     values: Any
     scale: Scale
-    failed: Any = None
+    failed: Any = False
     name: str = ""
 
 
@@ -170,6 +169,11 @@ class Panel(NamedTuple):
     parts: Sequence[Part]
     title: str = ""
 
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """Both axes, by letter."""
+        return {"x": self.x, "y": self.y}
+
 
 class Figure(NamedTuple):
     """Panels row by row, with a caption.
@@ -187,11 +191,6 @@ class Figure(NamedTuple):
     height: float = 3.6
 
 
-def stack(name: str, panels: Sequence[Panel], caption: str, height: float = 1.7) -> Figure:
-    """Panels of signals one above the other."""
-    return Figure(name, panels, caption, height=height)
-
-
 def arrange(count: int) -> int:
     """Columns of so many panels."""
     return 2 if count == 4 else min(count, 3)
@@ -199,12 +198,22 @@ def arrange(count: int) -> int:
 
 def join(axis: Any, parts: Iterable[slice], *signals: Any) -> list[Array]:
     """Values of an axis and of signals over it, part by part, with a NaN between parts where lines break."""
-    rows = list(parts)
-    break_ = np.full(1, np.nan)
-    # the place of a break does not matter, but lines are thinned along it
-    times = [[np.asarray(axis, float)[part], np.asarray(axis, float)[part][-1:]] for part in rows]
-    values = [[[np.asarray(signal, float)[part], break_] for part in rows] for signal in signals]
-    return [np.concatenate(list(itertools.chain(*pieces))) for pieces in (times, *values)]
+    # the place of a break does not matter, but lines are thinned along it: the last sample once more
+    samples = [np.r_[part, part.stop - 1] for part in parts]
+    columns = [np.asarray(values, float)[np.concatenate(samples)] for values in (axis, *signals)]
+    for column in columns[1:]:
+        column[np.cumsum([*map(len, samples)]) - 1] = np.nan
+    return columns
+
+
+def draw_signals(time: Any, segments: Iterable[slice], signals: Iterable[tuple[Any, str, str, str]]) -> list[Panel]:
+    """A panel over time for each signal: its values, label, unit and colour; lines break between segments."""
+    signals = list(signals)
+    time, *joined = join(time, segments, *(values for values, *_ in signals))
+    return [
+        Panel(TIME, Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
+        for values, (_, label, unit, colour) in zip(joined, signals, strict=True)
+    ]
 
 
 def intervals(
@@ -215,8 +224,8 @@ def intervals(
     rows = np.repeat(np.asarray(places, float), 3)
     pairs = (ends, rows), (middle, places)
     bar, points = ((y, x) if upright else (x, y) for x, y in pairs)
-    colour = how.get("colour", BLACK)
-    return [Line(*bar, colour=colour, width=1.8, opacity=0.6), Line(*points, name, **{"width": 0.0, "marker": "o"} | how)]
+    bars = Line(*bar, colour=how.get("colour", BLACK), width=1.8, opacity=0.6)
+    return [bars, Line(*points, name, **{"width": 0.0, "marker": "o"} | how)]
 
 
 def mark(x: float, y: float, name: str, marker: str = "*", size: float = 14.0) -> Line:
@@ -233,24 +242,18 @@ ZERO = Span(0.0, 0.0, colour=FAINT, along="y", width=0.8, dashes="-")
 """A faint line at y = 0."""
 
 
-def place_words(x: Any, y: Any, texts: Sequence[str]) -> Line:
-    """Words beside places."""
-    return Line(x, y, width=0.0, marker=" ", texts=texts)
-
-
-def shade_gap(half: float, name: str) -> Span:
-    """The gap of a transmission over its twist; `half` of it lies on either side of 0."""
-    return Span(-half, half, name, "#F3E3A1", opacity=0.6)
+def shade_gap(half: float, name: str) -> list[Span]:
+    """The gap of a transmission over its twist, if it has one; `half` of it lies on either side of 0."""
+    return [Span(-half, half, name, "#F3E3A1", opacity=0.6)] if half else []
 
 
 def thin(part: Part) -> Part:
     """A line or a band with as many points as can be seen: of a signal least and largest of each of its bins, of a path or
     a cloud every n-th."""
     if isinstance(part, Band):
-        rows = envelope(part.low, part.high)
-        return part._replace(
-            x=np.asarray(part.x)[rows[0]], low=np.asarray(part.low)[rows[0]], high=np.asarray(part.high)[rows[1]]
-        )
+        x, low, high = map(np.asarray, part[:3])
+        least, largest = envelope(low, high)
+        return part._replace(x=x[least], low=low[least], high=high[largest])
     if not isinstance(part, Line) or len(part.x) <= _LINE_POINTS:
         return part
     x, y = np.asarray(part.x, float), np.asarray(part.y, float)
@@ -267,33 +270,26 @@ def envelope(low: Any, high: Any) -> list[Array]:
     size = -(-len(low) // (_LINE_POINTS // 2))
     rows = []
     for values, find, filler in ((low, np.argmin, np.inf), (high, np.argmax, -np.inf)):
-        padded = np.pad(np.asarray(values, float), (0, -len(values) % size), constant_values=np.nan).reshape(-1, size)
-        best = find(np.where(np.isnan(padded), filler, padded), axis=1)
-        # a break stays one
-        rows.append(np.minimum(np.arange(len(padded)) * size + best, len(values) - 1))
+        # the first of a bin that is a break, so that it stays one
+        there = np.where(np.isnan(values), filler, values)
+        bins = np.pad(there, (0, -len(values) % size), constant_values=filler).reshape(-1, size)
+        rows.append(np.arange(len(bins)) * size + find(bins, axis=1))
     return rows
 
 
-def limits(*values: Any, share: float = 0.001, room: float = 0.12, inside: Sequence[float] = ()) -> Pair | None:
+def limits(*values: Any, inside: Sequence[float] = ()) -> Pair | None:
     """Ends of an axis that a few outliers do not set; None (those of what is drawn) where no value is finite.
 
-    `share` of the values may lie outside at each end, `room` is added there as a share of the span, and `inside` lie within
-    in any case.
+    A thousandth of the values may lie outside at each end, and 12 % of the span is added; `inside` lie within in any case.
     """
     finite = np.concatenate(values)
     finite = finite[np.isfinite(finite)]
     if not len(finite):
         return None
-    low, high = np.quantile(finite, [share, 1.0 - share])
-    low, high = min(low, high, *inside), max(low, high, *inside)
-    margin = room * (high - low) or 1e-12 + 0.1 * abs(high)
+    ends = [*np.quantile(finite, [0.001, 0.999]), *inside]
+    low, high = min(ends), max(ends)
+    margin = 0.12 * (high - low) or 1e-12 + 0.1 * abs(high)
     return float(low - margin), float(high + margin)
-
-
-def stretches(there: Any) -> list[tuple[int, int]]:
-    """First, and one after the last, index of each stretch that is true."""
-    steps = np.flatnonzero(np.diff(there, prepend=False, append=False))
-    return list(zip(steps[::2], steps[1::2], strict=True))
 
 
 def round_ticks(low: float, high: float) -> list[float]:
@@ -361,7 +357,7 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         ends: of x and y, as they are drawn.
     """
     content: JsonObject = {"place": [round(number, 5) for number in place], "title": panel.title.replace("\n", ", ")}
-    for name, axis, drawn_ends in zip("xy", panel[:2], ends, strict=True):
+    for (name, axis), drawn_ends in zip(panel.axes.items(), ends, strict=True):
         content[name] = {
             "label": axis.label.replace("\n", " "), "key": axis.key, "log": axis.log,
             "ends": [float(f"{end:.8g}") for end in drawn_ends],
@@ -370,8 +366,8 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
     for part in map(thin, panel.parts):
         if isinstance(part, Line | Band | Span):
             fields = part._asdict() | {"sorted": isinstance(part, Line) and part.is_sorted}
-            curves = () if isinstance(part, Span) else ("x", "y", "low", "high")
-            fields |= {key: pack_numbers(values) for key, values in fields.items() if key in curves}
+            curves = set() if isinstance(part, Span) else {"x", "y", "low", "high"}
+            fields |= {key: pack_numbers(fields[key]) for key in fields.keys() & curves}
             content[f"{type(part).__name__.lower()}s"].append(fields)
         elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
             cells = {key: pack_numbers(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
@@ -385,7 +381,7 @@ def describe_panel(panel: Panel, ends: Sequence[Pair]) -> str:
     head = f"{panel.title}: ".replace("\n", ", ") if panel.title else ""
     axes = [
         f"{name} {axis.label or 'without a name'} from {low:.3g} to {high:.3g}{' (logarithmic)' if axis.log else ''}"
-        for name, axis, (low, high) in zip("xy", panel[:2], ends, strict=True)
+        for (name, axis), (low, high) in zip(panel.axes.items(), ends, strict=True)
         if not axis.names
     ]
     names = [part.name for part in panel.parts if isinstance(part, Line) and part.name]

@@ -3,11 +3,9 @@
 Without refinement in its neighbourhood that is a point of the coarse grid: its block is one coarse cell, centred on it.
 """
 
-from itertools import starmap
-
 import numpy as np
 import pandas as pd
-from pandas import DataFrame, Series
+from pandas import DataFrame
 from scipy.spatial import KDTree
 
 from jaxbl.sweeps.points import Points
@@ -26,28 +24,28 @@ class Filling:
 
     def __init__(self, points: Points, frame: DataFrame, x: str, y: str):
         assert points.refinement is not None
-        self.paths, self._values, self._cells = [y, x], [], []
-        for path in self.paths:
+        # values of each axis, and how many of them a coarse cell has
+        self._axes: dict[str, tuple[Array, int]] = {}
+        for path in (y, x):
             refined = path in points.refinement.paths
-            self._values.append(points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float)))
-            self._cells.append(1 << refined * points.refinement.grid.depth)
+            values = points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float))
+            self._axes[path] = values, 1 << refined * points.refinement.grid.depth
 
     def _places(self, frame: DataFrame) -> Array:
         """Positions `(rows, 2)` of a frame's rows in the plane, in coarse cells."""
-        positions = zip(self._values, self._cells, (frame[path] for path in self.paths), strict=True)
-        return np.stack([np.searchsorted(values, column) / cell for values, cell, column in positions], axis=1)
+        places = [np.searchsorted(values, frame[path]) / cell for path, (values, cell) in self._axes.items()]
+        return np.stack(places, axis=1)
 
     def _nearest(self, simulated: DataFrame, asked: DataFrame) -> Array:
         """The simulated row nearest to each row asked for, within half a coarse cell; their number where there is none."""
         # of two that are as near the upper one
         return KDTree(self._places(simulated)).query(self._places(asked) + 1e-6, p=np.inf, distance_upper_bound=0.50001)[1]
 
-    def dense(self, table: Series) -> tuple[Array, Array, Array]:
-        """Values of x `(columns,)` and y `(rows,)`, and a table over (y, x) on the whole plane `(rows, columns)`."""
-        y, x = starmap(_drawn_values, zip(self._values, self._cells, strict=True))
-        plane = pd.MultiIndex.from_product([y, x], names=self.paths).to_frame()
-        nearest = self._nearest(table.index.to_frame(), plane)
-        return x, y, np.append(table.to_numpy(float), np.nan)[nearest].reshape(len(y), len(x))
+    def fill(self, table: DataFrame) -> DataFrame:
+        """A table over (y, x) on the whole plane: rows of the nearest places, NaN where there is none."""
+        plane = pd.MultiIndex.from_product([_drawn_values(*axis) for axis in self._axes.values()], names=[*self._axes])
+        nearest = self._nearest(table.index.to_frame(), plane.to_frame())
+        return table.reset_index(drop=True).reindex(nearest).set_axis(plane)
 
     def complete(self, frame: DataFrame, paths: list[str]) -> DataFrame:
         """A frame in which each vertex that was simulated at any values of the other axes has rows at all of them.
@@ -56,7 +54,7 @@ class Filling:
         """
         if not paths or frame.empty:
             return frame
-        vertices, parts = frame[self.paths].drop_duplicates(), []
+        vertices, parts = frame[[*self._axes]].drop_duplicates(), []
         for _, part in frame.groupby([*paths, "seed"], sort=False):
             nearest = self._nearest(part, vertices)
             there = nearest < len(part)
@@ -72,11 +70,17 @@ def _drawn_values(values: Array, cell: int) -> Array:
     return values[::step]
 
 
+def coarse_axes(points: Points) -> dict[str, Array]:
+    """Values of the coarse grid along the refined axes, by path; none of a study that is not refined."""
+    if points.refinement is None:
+        return {}
+    stride = 1 << points.refinement.grid.depth
+    return {path: points.axis_values(path)[::stride] for path in points.refinement.paths}
+
+
 def on_coarse_values(points: Points, frame: DataFrame, drawn: list[str]) -> DataFrame:
     """The rows of a refined study whose values are on the coarse grid along all axes but those drawn."""
-    assert points.refinement is not None
-    stride = 1 << points.refinement.grid.depth
-    for path in points.refinement.paths:
+    for path, values in coarse_axes(points).items():
         if path not in drawn:
-            frame = frame.loc[np.isin(frame[path], points.axis_values(path)[::stride])]
+            frame = frame.loc[np.isin(frame[path], values)]
     return frame

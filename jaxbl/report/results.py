@@ -7,24 +7,12 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.errors import InputError
-from jaxbl.estimation.element import ElementIdentification
-from jaxbl.estimation.identify import Identification
 from jaxbl.files import ResultFolder, Subject, lock_folder, log_subject, to_path
 from jaxbl.fused import SCAN_MESSAGE
-from jaxbl.gains.loop_gains import LoopTuning
-from jaxbl.gains.observer_choice import ObserverChoice
-from jaxbl.gains.tune import Tuning
-from jaxbl.gains.verify import Verdict
 from jaxbl.lines import format_duration
-from jaxbl.monitoring.watch import Watch
-from jaxbl.records import Inspection
 from jaxbl.result import Result
-from jaxbl.sweeps.compare import Comparison
 from jaxbl.sweeps.store import study_subject
-from jaxbl.sweeps.sweep import StudyResult
-from jaxbl.sweeps.trial import Trial
 from jaxbl.validation import suggest_word
 
 from . import (
@@ -61,27 +49,28 @@ class _Kind(NamedTuple):
     file: str = PAGE
     subject: Callable[[Any], Subject] = lambda result: study_subject(result.config)
 
-    def describe(self, result: Any) -> Result:
-        return self.report.describe(result.summary if self.subject is _log else result)
-
 
 def _log(result: Any) -> Subject:
     return log_subject(Path(result.summary["file"]))
 
 
-_KINDS = {
-    Trial: _Kind(simulate, "summary.json"),
-    StudyResult: _Kind(sweep),
-    Tuning: _Kind(tune, "tuning.json"),
-    ObserverChoice: _Kind(observer_choice, "tuning.json"),
-    LoopTuning: _Kind(loop_gains, "tuning.json"),
-    Verdict: _Kind(verify),
-    Comparison: _Kind(compare, "comparison.json", lambda _: Subject("comparison")),
-    Inspection: _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path)),
-    Identification: _Kind(identify, "identification.json", _log),
-    ElementIdentification: _Kind(element, "identification.json", _log),
-    Diagnosis: _Kind(diagnose, "diagnosis.json", _log),
-    Watch: _Kind(watch, "watch.json", lambda result: log_subject(Path(result.task.name))),
+_KINDS: dict[type, _Kind] = {
+    # the result that `draw` of a module takes
+    next(iter(kind.report.draw.__annotations__.values())): kind
+    for kind in (
+        _Kind(simulate, "summary.json"),
+        _Kind(sweep),
+        _Kind(tune, "tuning.json"),
+        _Kind(observer_choice, "tuning.json"),
+        _Kind(loop_gains, "tuning.json"),
+        _Kind(verify),
+        _Kind(compare, "comparison.json", lambda _: Subject("comparison")),
+        _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path)),
+        _Kind(identify, "identification.json", _log),
+        _Kind(element, "identification.json", _log),
+        _Kind(diagnose, "diagnosis.json", _log),
+        _Kind(watch, "watch.json", lambda result: log_subject(Path(result.task.name))),
+    )
 }
 
 
@@ -89,15 +78,11 @@ class Drawings(list[Figure]):
     """Figures (:class:`jaxbl.report.panels.Figure`), which a notebook shows."""
 
     def _repr_html_(self) -> str:
-        return "".join(map(_format_figure, self))
-
-
-def _format_figure(figure: Figure) -> str:
-    image = picture(figure)
-    return (
-        f'<figure><img src="{image.source}" alt="{escape(image.described)}" style="max-width:100%">'
-        f"<figcaption>{escape(image.caption)}</figcaption></figure>"
-    )
+        return "".join(
+            f'<figure><img src="{image.source}" alt="{escape(image.described)}" style="max-width:100%">'
+            f"<figcaption>{escape(image.caption)}</figcaption></figure>"
+            for image in map(picture, self)
+        )
 
 
 def draw(result: Any, *names: str) -> Drawings:
@@ -127,7 +112,8 @@ def describe(result: Any) -> Result:
     Raises:
         InputError: no result of these.
     """
-    described, cost = _kind_of(result).describe(result), getattr(result, "cost", None)
+    kind, cost = _kind_of(result), getattr(result, "cost", None)
+    described = kind.report.describe(result.summary if kind.subject is _log else result)
     details = [*described.details]
     if cost and cost["lanes"]:
         compiling, computing = format_duration(cost["compile_seconds"]), format_duration(cost["run_seconds"])

@@ -24,7 +24,6 @@ from .panels import (
     Figure,
     Line,
     Panel,
-    stack,
 )
 
 
@@ -42,29 +41,20 @@ def describe(trial: Trial) -> Result:
     failed = [side for side in sides if not metrics[f"{side}.converged"]]
     verdict, headline = "failed", "The run diverges: a number overflows."
     if metrics["finite"] and failed:
-        who = (
-            f"The {failed[0]} observer does not converge"
-            if len(sides) != len(failed) or len(sides) == 1
-            else "Neither observer converges"
-        )
+        who = "Neither observer converges" if len(failed) > 1 else f"The {failed[0]} observer does not converge"
         headline = f"{who}: an error exceeds its tolerance in the last quarter of the run."
     elif metrics["finite"]:
         times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
-    units = {"velocity": "rad/s", "torque": "N m"}
-    errors = {(side, quantity): metrics[f"{side}.{quantity}_rmse"] for side in sides for quantity in units}
-    largest = {side: limits.velocity_tolerance / drive.ratio(side) for side in sides}
-    bounds = {(side, "velocity"): f"; the largest may be {largest[side]:.3g}" for side in sides}
+    quantities = [(side, *quantity) for side in sides for quantity in (("velocity", "rad/s"), ("torque", "N m"))]
     if trial.config.controller is not None:
-        side, units["following"] = trial.config.controller.side, "rad"
-        errors[side, "following"] = metrics[f"{side}.following_rmse"]
-    figures = [
-        KeyFigure(
-            "diverges" if error is None else f"{error:.3g} {units[key[1]]}",
-            f"{key[0]}: {key[1]} error, rms{bounds.get(key, '')}",
-        )
-        for key, error in errors.items()
-    ]
+        quantities.append((trial.config.controller.side, "following", "rad"))
+    figures = []
+    for side, quantity, unit in quantities:
+        error, largest = metrics[f"{side}.{quantity}_rmse"], limits.velocity_tolerance / drive.ratio(side)
+        bound = f"; the largest may be {largest:.3g}" if quantity == "velocity" else ""
+        text = "diverges" if error is None else f"{error:.3g} {unit}"
+        figures.append(KeyFigure(text, f"{side}: {quantity} error, rms{bound}"))
     rows = [
         [name, *(metrics.get(f"{side}.{name}") for side in sides), metric.unit, metric.doc]
         for name, metric in SIDE_METRICS.items()
@@ -85,19 +75,17 @@ def draw(trial: Trial) -> list[Figure]:
     trace, controller = trial.trace, trial.config.controller
     is_geared = trial.config.is_geared
     name, seen_from = ("transmitted torque C", SIDES) if is_geared else ("disturbance torque", ("motor",))
-    estimates = {f"from the {side} observer": (trace[f"{side}.torque_estimate"], SIDE_COLOURS[side]) for side in seen_from}
+    estimates = {f"from the {side} observer": (f"{side}.torque_estimate", SIDE_COLOURS[side]) for side in seen_from}
     caption = f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16)."
-    figures = [_compare("torque", trace, name, "N m", ("true", trace["torque"]), estimates, caption)]
+    figures = [_compare("torque", trace, name, "N m", ("true", "torque"), estimates, caption)]
     for side in trial.config.sides:
-        true, estimate = (trace[f"{side}.velocity{end}"] for end in ("", "_estimate"))
+        name, observed = f"{side}.velocity", {"observer": (f"{side}.velocity_estimate", VERMILION)}
         caption = f"{side.capitalize()} velocity, true and observed, and the error."
-        observed = {"observer": (estimate, VERMILION)}
-        figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", ("true", true), observed, caption))
+        figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", ("true", name), observed, caption))
     if controller is not None:
-        target, position = ("reference", trace["reference"]), trace[f"{controller.side}.position"]
+        name, moved = f"{controller.side} position", {"true": (f"{controller.side}.position", VERMILION)}
         caption = f"{controller.side.capitalize()} position, the reference that it is to follow, and the error."
-        name = f"{controller.side} position"
-        figures.append(_compare("following", trace, name, "rad", target, {"true": (position, VERMILION)}, caption))
+        figures.append(_compare("following", trace, name, "rad", ("reference", "reference"), moved, caption))
     judged = trial.summary["conditions"]
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     figures += itertools.chain(*(error_plane(trace, side, gains) for side, gains in judged.items()))
@@ -109,19 +97,20 @@ def _compare(
     trace: DataFrame,
     quantity: str,
     unit: str,
-    reference: tuple[str, Any],
-    estimates: Mapping[str, tuple[Any, str]],
+    reference: tuple[str, str],
+    estimates: Mapping[str, tuple[str, str]],
     caption: str,
 ) -> Figure:
-    """A signal with what follows it, each with its colour, over time, and below by how much these are off."""
-    (label, true), time = reference, trace["t"]
-    above = [Line(time, values, key, colour, 2.0, opacity=0.75) for key, (values, colour) in estimates.items()]
+    """A signal (its label and column) with what follows it (column and colour by label), over time, and below by how much
+    these are off."""
+    label, time, true = reference[0], trace["t"], trace[reference[1]]
+    above = [Line(time, trace[column], key, colour, 2.0, opacity=0.75) for key, (column, colour) in estimates.items()]
     below = [line._replace(y=true - line.y, name="", width=1.0) for line in above]
     panels = [
         Panel(TIME, Axis(f"{quantity} ({unit})"), [*above, Line(time, true, label, width=1.0)]),
         Panel(TIME, Axis(f"error ({unit})"), [ZERO, *below]),
     ]
-    return stack(name, panels, caption)
+    return Figure(name, panels, caption, height=1.7)
 
 
 def _hysteresis(trace: DataFrame) -> Figure:

@@ -37,7 +37,11 @@ def describe(result: StudyResult) -> Result:
     tables = [_law_table(laws)] * bool(laws)
     tables += (_importance_table(side, ranked) for side, ranked in survey.importance.items())
     answer = answer_sweep(result, survey)
-    return replace(answer, remarks=[*answer.remarks, *_law_lines(laws)], tables=tables)
+    # the table says which
+    agreeing = (
+        f"Accuracy laws: {sum(law.agrees for law in laws)} of {len(laws)} have a slope within {AGREEMENT:g} of theory."
+    )
+    return replace(answer, remarks=[*answer.remarks, *[agreeing] * bool(laws)], tables=tables)
 
 
 def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result:
@@ -98,34 +102,31 @@ class _Survey:
     def __init__(self, result: StudyResult):
         config = result.config
         paths = config.axis_paths
-        metrics = [f"{side}.{name}" for side in config.sides for name in ("converged", "velocity_rmse", "margin_alpha")]
-        metrics = [name for name in metrics if name in result.columns]
+        names = "converged", "velocity_rmse", "margin_alpha"
+        metrics = [column for column in result.columns if column.rpartition(".")[2] in names]
         self.sides = [side for side in config.sides if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
-        points = Points(config) if config.sweep.refine is not None else None
+        points = Points(config)
         self.runs = self.even = self.diverged = 0
         self.converged = dict.fromkeys(self.sides, 0)
         self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
         for frame in result.batches([*paths, "seed", "finite", *metrics]):
-            even = frame if points is None else frame[points.on_coarse_grid(frame)]
+            even = frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
             self.diverged += int((~frame["finite"].astype(bool)).sum())
             for side in self.sides:
                 self.converged[side] += int(even[f"{side}.converged"].sum())
-        errors = {side: f"{side}.velocity_rmse" for side in config.sides}
-        ranked = {side: rank_axes(result, error) for side, error in errors.items() if error in metrics}
-        self.importance = {side: axes for side, axes in ranked.items() if axes}
-        for side in self.sides if config.sweep.design == "grid" else []:
-            gains = [
-                axis.path
-                for axis in config.axes
-                if axis.path.startswith(f"observer.{side}.") and values_of(config, axis) > 1
-            ]
-            if gains and f"{side}.velocity_rmse" in metrics:
+        self.importance: dict[str, list[AxisImportance]] = {}
+        varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
+        for side in config.sides:
+            error, gains = f"{side}.velocity_rmse", [path for path in varied if path.startswith(f"observer.{side}.")]
+            if error in metrics and (ranked := rank_axes(result, error)):
+                self.importance[side] = ranked
+            if error in metrics and side in self.sides and gains:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
                 groups = Groups(Rows(result, columns), gains, paths)
-                runs = worst_runs(groups, f"{side}.velocity_rmse", f"{side}.margin_alpha" in metrics)
+                runs = worst_runs(groups, error, f"{side}.margin_alpha" in metrics)
                 self.best[side] = best_gains(runs), runs
 
 
@@ -154,12 +155,6 @@ def _best_lines(side: str, best: BestGains | None) -> Lines:
         f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
         for gain, way in best.ends.items()
     ]
-
-
-def _law_lines(laws: list[Law]) -> Lines:
-    """Say how many laws agree with theory; the table says which."""
-    count = sum(law.agrees for law in laws)
-    return [f"Accuracy laws: {count} of {len(laws)} have a slope within {AGREEMENT:g} of theory."] * bool(laws)
 
 
 def _explain_ends(law: Law) -> str:

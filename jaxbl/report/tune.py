@@ -45,16 +45,11 @@ def error_label(summary: JsonObject) -> str:
 def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
-    coarse = tuning.candidates[side].query("stage == 0")
-    tables = coarse.astype({"feasible": float, "converged": float}).pivot_table(
-        index="lambda",
-        columns="alpha",
-        values=["error", "feasible"],
-        dropna=False,
-    )
-    grid, failed = tables["error"].to_numpy(float), ~(tables["feasible"].to_numpy(float) >= 0.5)
+    coarse = tuning.candidates[side].query("stage == 0").astype({"feasible": float})
+    error, feasible = (coarse.pivot_table(name, "lambda", "alpha", dropna=False) for name in ("error", "feasible"))
+    grid, failed = error.to_numpy(float), ~(feasible.to_numpy() >= 0.5)
     values = np.where(failed, np.nan, grid)
-    x, y = (cell_edges(axis.to_numpy(float), True) for axis in (tables["error"].columns, tables.index))
+    x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
     alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
     parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
@@ -139,17 +134,18 @@ def describe(tuning: Tuning) -> Result:
         verdict, headline = "doubtful", f"{headline} Little reserve until they fail or err twice as much: {', '.join(thin)}."
     if beaten := _better_gains(summary):
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
-    remarks = [*doubts_among(summary["remarks"]), *_reasons(summary)]
+    doubts = doubts_among(summary["remarks"])
+    remarks = [*doubts, *_reasons(summary), *certified]
     if is_refuted(summary):
         verdict, headline = "failed", "The search found an error above what was proven."
-    details = [line for line in summary["remarks"] if line not in remarks]
+        remarks = [*certified, *doubts, *_reasons(summary)]
+    details = [line for line in summary["remarks"] if line not in doubts]
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
         _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
     ]
     title = tuning.config.title or "Gains"
-    remarks = [*certified, *remarks] if is_refuted(summary) else [*remarks, *certified]
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
 
 

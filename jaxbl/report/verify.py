@@ -21,7 +21,7 @@ from .loop_gains import margin_table
 from .maps import cell_edges
 from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mark
 
-_USUAL = ("usual pair (1.5, 1.1)", 1.1, 1.5)
+_USUAL = {"name": "usual pair (1.5, 1.1)", "alpha_ratio": 1.1, "lambda_ratio": 1.5}
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 
 
@@ -32,18 +32,18 @@ def draw(verdict: Verdict) -> list[Figure]:
 
 def _mark_gains(verdict: Verdict) -> list[Line]:
     """Marks of the usual pair and of the study's marks."""
-    places = [_USUAL]
-    for gains in verdict.summary["marks"]:
-        if gains["alpha_ratio"] is not None:
-            places.append((literal(gains["name"]), gains["alpha_ratio"], gains["lambda_ratio"]))
-    pairs = zip(places, itertools.cycle(("*", *MARKERS)), strict=False)
-    return [mark(x, y, name, marker, 12.0) for (name, x, y), marker in pairs]
+    marks = [_USUAL, *(gains for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None)]
+    return [
+        mark(gains["alpha_ratio"], gains["lambda_ratio"], literal(gains["name"]), marker, 12.0)
+        for gains, marker in zip(marks, itertools.cycle(("*", *MARKERS)), strict=False)
+    ]
 
 
 def _atlas(verdict: Verdict) -> Figure:
     plane = verdict.error_map
     scale = Scale(0.05, 20.0, "ratio ρ of successive velocity peaks, simulated", True, "PuOr_r")
-    edges = [cell_edges(values, True) for values in (plane.alpha, plane.lambda_)]
+    ranges = {"α / f⁺": plane.alpha, "λ / √f⁺": plane.lambda_}
+    edges = [cell_edges(values, True) for values in ranges.values()]
     curves = condition_curves(list_conditions(verdict.config), 1.0, (plane.alpha[0], plane.alpha[-1]))
     step = max(len(plane.alpha) // 24, 1)
     boundary = Line(plane.alpha[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
@@ -53,13 +53,8 @@ def _atlas(verdict: Verdict) -> Figure:
         f"Simulated ratio of successive velocity peaks over {plane.ratio.size} cells; every condition demands a λ above its "
         "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
-    pairs = (("α / f⁺", plane.alpha), ("λ / √f⁺", plane.lambda_))
-    axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in pairs)
+    axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in ranges.items())
     return Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
-
-
-def _name(level: JsonObject) -> str:
-    return ", ".join(level[key] for key in ("level", "side") if level.get(key))
 
 
 def write(verdict: Verdict, folder: Path) -> str:
@@ -71,8 +66,8 @@ def describe(verdict: Verdict) -> Result:
     """Say whether the study's own gains and the marked ones are safe, and which conditions are wrong."""
     marks, levels, own_gains = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
-    exact = [(level, entry) for level in levels for entry in level["conditions"] if entry["name"] == "exact"]
-    failures = sum(entry["counterexamples"] for _, entry in exact)
+    exact = (entry for level in levels for entry in level["conditions"] if entry["name"] == "exact")
+    failures = sum(entry["counterexamples"] for entry in exact)
     extent = (
         f"{levels[0]['cells']} cells of the error system and {sum(level['cells'] for level in levels[1:])} runs of the drive"
     )
@@ -129,9 +124,8 @@ def _level_lines(verdict: Verdict) -> Lines:
             counts = ", ".join(f"{entry['title']} {entry['counterexamples']} of {entry['holds']}" for entry in wrong)
             causes = list(level["causes"].get("true", {}).items())[:4]
             text = ", ".join(f"{cause} ({count})" for cause, count in causes)
-            lines.append(
-                f"{_name(level)}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}."
-            )
+            name = ", ".join(level[key] for key in ("level", "side") if level.get(key))
+            lines.append(f"{name}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}.")
     return lines
 
 
@@ -151,7 +145,8 @@ def _level_table(level: JsonObject) -> ResultTable:
 
 
 def _mark_table(marks: list[JsonObject]) -> ResultTable:
-    keys = {
+    columns = {
+        "name": "",
         "lambda": "λ",
         "alpha": "α",
         "f_plus": "true f⁺",
@@ -164,5 +159,5 @@ def _mark_table(marks: list[JsonObject]) -> ResultTable:
         "converged": "converged",
         "convergence_time": "after (s)",
     }
-    rows = [[gains["name"], *(gains[key] for key in keys)] for gains in marks]
-    return ResultTable("Marked gains, run on the study's drive with ideal encoders", ["", *keys.values()], rows)
+    rows = [[gains[key] for key in columns] for gains in marks]
+    return ResultTable("Marked gains, run on the study's drive with ideal encoders", [*columns.values()], rows)

@@ -1,10 +1,8 @@
 """What `jaxbl watch` leaves: values over time as CSV, a summary, one figure, and a page."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import tomli_w
 
@@ -12,10 +10,11 @@ from jaxbl.files import catch_write_errors, write_json
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
+from jaxbl.records.signal_quality import find_runs
 from jaxbl.result import KeyFigure, Result
 
 from .numbers import lead_with_doubt
-from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits, stack, stretches
+from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits
 
 VALUES = "watch.csv"
 SUMMARY = "watch.json"
@@ -81,9 +80,8 @@ def describe(watch: Watch) -> Result:
     return result if verdict == "failed" else lead_with_doubt(result)
 
 
-@contextmanager
-def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject], None]]:
-    """`watch.csv` while it grows, from the first values on: a function that adds values, which others can read at once."""
+def open_values(folder: Path, task: WatchTask) -> Callable[[JsonObject], None]:
+    """Return a function that adds values to `watch.csv`, which others can read at once; the first ones begin it anew."""
     mode = "w"
 
     def add(values: JsonObject) -> None:
@@ -93,7 +91,7 @@ def values_file(folder: Path, task: WatchTask) -> Iterator[Callable[[JsonObject]
             row.to_csv(folder / VALUES, mode=mode, header=mode == "w", index=False)
         mode = "a"
 
-    yield add
+    return add
 
 
 def draw(watch: Watch) -> list[Figure]:
@@ -101,28 +99,29 @@ def draw(watch: Watch) -> list[Figure]:
     values, task, limit = watch.values, watch.task, watch.task.alarm_gap
     law = [name for name in ("half_gap", "stiffness") if f"motor.{name}" in values]
     # friction of each side acts on a shaft of its own
-    rows = [(name, SIDES) for name in law] + [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
+    friction = [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
     if not len(values):
         return []
     time, panels = values["t"].to_numpy(float), []
     half = 0.5 * task.interval
     x = Axis("time (s)", ends=(time[0] - half, time[-1] + half))
-    for name, sides in rows:
+    for name, sides in [*((name, SIDES) for name in law), *friction]:
         parts, curves, inside = list[Part](), [], []
         if name == "half_gap" and limit is not None:
             inside = [limit]
+            starts, ends = find_runs(values["alarm"].to_numpy(bool))
             parts += [
-                Span(time[start] - half, time[end - 1] + half, "alarm", VERMILION, opacity=0.12)
-                for start, end in stretches(values["alarm"].to_numpy(bool))
+                Span(start, end, "alarm", VERMILION, opacity=0.12)
+                for start, end in zip(time[starts] - half, time[ends - 1] + half, strict=True)
             ]
             parts.append(Span(limit, limit, "limit", along="y", width=1.2))
         for side in sides:
-            middle, error = (values[f"{side}.{name}{kind}"].to_numpy(float) for kind in ("", "_error"))
+            middle, error = (values[f"{side}.{name}{kind}"].astype(float) for kind in ("", "_error"))
             low, high = middle - INTERVAL * error, middle + INTERVAL * error
             who = f"by the {side}'s observer"
             parts += [Band(time, low, high, "", SIDE_COLOURS[side]), Line(time, middle, who, SIDE_COLOURS[side])]
             # what is hardly determined would set the scale of all else
-            sure = error <= 3.0 * np.nanmedian(error) if np.isfinite(error).any() else np.isfinite(error)
+            sure = error <= 3.0 * error.median()
             curves += [middle[sure], low[sure], high[sure]]
         lead = f"{sides[0]} " if len(sides) == 1 else ""
         y = Axis(f"{LABELS[name]}\n{lead}({task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))
@@ -132,4 +131,4 @@ def draw(watch: Watch) -> list[Figure]:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
     # gap and stiffness are seen at once, friction below
     parted = {"watch": panels[: len(law)], "watch_friction": panels[len(law) :]}
-    return [stack(name, part, caption, 1.5) for name, part in parted.items() if part]
+    return [Figure(name, part, caption, height=1.5) for name, part in parted.items() if part]

@@ -17,9 +17,7 @@ from jaxbl.estimation.regression import Kinematics, model_torques
 from jaxbl.records import read_record
 from jaxbl.records.least_squares import rms
 from jaxbl.report.drawing import save
-from jaxbl.report.identify import describe as describe_identification
-from jaxbl.report.identify_figures import draw as draw_identification
-from jaxbl.report.log_signals import LogSignals
+from jaxbl.report.identify import LogSignals, describe as describe_identification, draw as draw_identification
 from jaxbl.report.results import write_report
 from jaxbl.sweeps.trial import run
 
@@ -187,7 +185,7 @@ def test_torque_of_a_side_is_less_the_effects_on_it(tmp_path):
     for found in (result, bare_result):
         log = LogSignals(found)
         law = log.low_passed(log["torque"])
-        errors.append(min(rms((torque - law)[log.settled]) for torque in log.torques.values()))
+        errors.append(min(rms((torque - law)[log.settled]) for torque in map(log.torque_by, log.sides)))
     assert errors[0] < 0.6 * errors[1]
 
 

@@ -117,11 +117,11 @@ def test_filling_is_exact_where_every_vertex_is_known():
     result = make_refined_study(lambda frame: frame[ALPHA] > 0.0)
     points = Points(result.config)
     frame = pd.DataFrame(points.columns(np.arange(points.group_size)))
-    table = frame.assign(value=np.arange(len(frame))).set_index([LAMBDA, ALPHA])["value"]
-    xs, ys, grid = Filling(points, frame, ALPHA, LAMBDA).dense(table)
+    table = frame.assign(value=np.arange(len(frame))).set_index([LAMBDA, ALPHA])[["value"]]
+    grid = Filling(points, frame, ALPHA, LAMBDA).fill(table)["value"].unstack()
     np.testing.assert_array_equal(grid, np.arange(33**2).reshape(33, 33))
-    np.testing.assert_array_equal(xs, points.axis_values(ALPHA))
-    np.testing.assert_array_equal(ys, points.axis_values(LAMBDA))
+    np.testing.assert_array_equal(grid.columns, points.axis_values(ALPHA))
+    np.testing.assert_array_equal(grid.index, points.axis_values(LAMBDA))
 
 
 def test_a_map_shows_no_more_places_than_can_be_seen():

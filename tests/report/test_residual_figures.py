@@ -7,8 +7,8 @@ from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.localise import locate
 from jaxbl.diagnosis.residuals import Residual
 from jaxbl.diagnosis.sentences import sentence_of
+from jaxbl.report.diagnose import draw_residual
 from jaxbl.report.drawing import save
-from jaxbl.report.residuals import draw_residual
 
 
 def make_residual(name, torque, time):

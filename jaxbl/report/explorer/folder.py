@@ -27,8 +27,12 @@ ROW_GROUP = 1 << 17
 """Rows of a row group of the Parquet file."""
 _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
-_LIBRARIES = ("hyparquet.js", "hyparquet.LICENSE.txt", "uPlot.js", "uPlot.css", "uPlot.LICENSE.txt")
-_SCRIPTS = ("hyparquet", "uPlot", "shared", "chart", "common")
+_FILES = (
+    "vendored/hyparquet.js", "vendored/uPlot.js", "shared.js", "chart.js", "explorer/page/common.js",
+    "vendored/hyparquet.LICENSE.txt", "vendored/uPlot.LICENSE.txt", "vendored/uPlot.css", "page.css",
+    "explorer/page/explore.css",
+)  # fmt: skip
+"""Of every page; scripts in the order in which they are loaded."""
 
 
 @contextmanager
@@ -51,7 +55,8 @@ class Source(NamedTuple):
         identity: what tells them from other results.
         lead: what was found, in sentences.
         write: writes page and data into an empty folder, to be served or not; says whether there is more to come.
-        answers: to questions of a page that is served, by name.
+        answers: to questions of a page that is served, by name: from what is asked to what is answered, as plain data.
+            `InputError` is bad input.
         prepare: takes what time it can off the first answer.
         finish: waits for the answer that is being computed; none is computed after it.
     """
@@ -103,16 +108,14 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
                 text = f'jaxblBytes({number}, "{base64.b64encode(chunk).decode()}");\n'
                 (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
     report = files("jaxbl.report")
-    folder = report.joinpath("explorer", "page")
-    page, elements = (folder.joinpath(f"{name}.html").read_text(encoding="utf-8") for name in ("page", parts[0]))
-    loaded = "\n".join(f'<script src="{name}.js"></script>' for name in [*_SCRIPTS, *parts, "data"])
+    originals = [report.joinpath(name) for name in [*_FILES, *(f"explorer/page/{part}.js" for part in parts)]]
+    for original in originals:
+        (out / original.name).write_bytes(original.read_bytes())
+    page, elements = (report.joinpath(f"explorer/page/{name}.html").read_text("utf-8") for name in ("page", parts[0]))
+    names = [original.name for original in originals if original.name.endswith(".js")]
+    loaded = "\n".join(f'<script src="{name}"></script>' for name in [*names, "data.js"])
     page = page.replace("{parts}", elements).replace("{scripts}", loaded)
     (out / "index.html").write_text(page, encoding="utf-8")
-    copied = [report.joinpath("vendored", name) for name in _LIBRARIES]
-    copied += [report.joinpath(name) for name in ("page.css", "shared.js", "chart.js")]
-    copied += [folder.joinpath(name) for name in ("explore.css", "common.js", *(f"{part}.js" for part in parts))]
-    for original in copied:
-        (out / original.name).write_bytes(original.read_bytes())
 
 
 def colours_of(name: str) -> list[str]:

@@ -50,28 +50,21 @@ def _places(dim: AxisColumns, frame: pd.DataFrame) -> Array:
     return values.get_indexer(rows)
 
 
-def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path) -> JsonObject:
-    """Write `points.parquet`, and return what the page says of it.
+def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> JsonObject:
+    """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
+    Returns what the page says of it, and shows first.
 
     Args:
         result: a study over a grid; of an unfinished one, what is there.
         metrics: columns that are kept.
         first: the one that is drawn first.
         out: folder.
+        dims: as of :func:`dimensions`.
     """
-    dims = dimensions(result.config)
-    assert dims is not None
     axes = [
         {"paths": [axis_words(result.config, path) | {"values": to_jsonable(values)} for path, values in dim.items()]}
         for dim in dims
     ]
-    written = _write_points(result, metrics, first, out, dims)
-    return {"grid": True, "axes": axes, "conditions": _conditions()} | written
-
-
-def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> JsonObject:
-    """Write `points.parquet`: metrics as float32, rows in the order of the axes, nan where none is; in the memory of a part.
-    Returns what the page needs to read it, and what it shows first."""
     shape = [_length(dim) for dim in dims]
     rows, runs = math.prod(shape), 0
     with (
@@ -92,6 +85,9 @@ def _write_points(result: StudyResult, metrics: list[str], first: str, out: Path
         cells = {name: np.moveaxis(values.reshape(shape), (y, x), (-2, -1)) for name, values in columns.items()}
         telling = _most_telling(cells, first)
         return {
+            "grid": True,
+            "axes": axes,
+            "conditions": _conditions(),
             "rows": rows,
             "found": runs,
             "total": rows,
@@ -121,18 +117,17 @@ def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
     """The slice (places along the other dimensions, the seed the last) with the clearest border between what works and what
     fails; where none has a border, that with the largest spread of the metric."""
     values = cells.get(f"{first.partition('.')[0]}.converged", cells[first])
-    *sizes_of_slices, _ = values.shape[:-2]
-    best, telling = (-1.0, -1.0), (0,) * (len(sizes_of_slices) + 1)
-    for index in np.ndindex(*sizes_of_slices):
+
+    def rate_slice(index: tuple[int, ...]) -> tuple[float, float]:
         part = [array[(*index, 0)].reshape(-1) for array in (values, cells[first])]
         works, sizes = (array[:: max(array.size // _MOST_JUDGED, 1)] for array in part)
         works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes)])
         share = float(np.mean(works)) if works.size and values is not cells[first] else 0.0
         spread = float(np.std(np.log(sizes[sizes > 0.0]))) if np.any(sizes > 0.0) else 0.0
         # tenths: of slices with about the same border that with the larger spread
-        if (score := (round(10.0 * min(share, 1.0 - share)), spread)) > best:
-            best, telling = score, (*index, 0)
-    return telling
+        return round(10.0 * min(share, 1.0 - share)), spread
+
+    return *max(np.ndindex(*values.shape[:-3]), key=rate_slice), 0
 
 
 _MOST_STARRED = 1 << 16
@@ -144,15 +139,15 @@ def _stars(
 ) -> list[JsonObject]:
     """The best gains of each slice: places along all dimensions; none where the first map is not over gains."""
     side = first.partition(".")[0]
-    paths, shape = [next(iter(dims[i])) for i in (y, x)], cells[first].shape
+    paths, values = zip(*(next(iter(dims[i].items())) for i in (y, x)), strict=True)
+    shape = cells[first].shape
     needed = [name for name in (first, f"{side}.converged", f"{side}.margin_alpha", "finite") if name in cells]
     gains = {f"observer.{side}.alpha", f"observer.{side}.lambda"}
     if {*paths} != gains or not {"finite", f"{side}.converged"} <= {*needed} or math.prod(shape[-3:]) > _MOST_STARRED:
         return []
-    values = [np.asarray(next(iter(dims[i].values()))) for i in (y, x)]
     runs = pd.MultiIndex.from_product([range(shape[-3]), *values], names=["seed", *paths]).to_frame(index=False)
     stars = []
-    for index in [telling[:-1], *(index for index in np.ndindex(*shape[:-3]) if index != telling[:-1])][:64]:
+    for index in sorted(np.ndindex(*shape[:-3]), key=lambda index: index != telling[:-1])[:64]:
         frame = runs.assign(**{name: cells[name][index].ravel() for name in needed})
         if frame[["finite", f"{side}.converged"]].isna().to_numpy().any():
             continue
@@ -173,8 +168,8 @@ def _place_in_all(hidden: Sequence[int], x: int, y: int) -> Array:
 def _overview(values: Array) -> JsonObject:
     """The first picture: a map over the last two of three dimensions, median over the first, the seeds."""
     steps = [-(-size // _OVERVIEW) for size in values.shape[1:]]
-    samples = np.moveaxis(np.array(values[:, :: steps[0], :: steps[1]]), 0, -1)
-    cells = pd.DataFrame(samples.reshape(-1, samples.shape[-1])).median(axis=1).to_numpy().reshape(samples.shape[:-1])
+    samples = np.array(values[:, :: steps[0], :: steps[1]])
+    cells = pd.DataFrame(samples.reshape(len(samples), -1)).median().to_numpy().reshape(samples.shape[1:])
     return {"shape": list(cells.shape), "values": pack_numbers(cells)}
 
 

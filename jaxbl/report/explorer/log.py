@@ -1,6 +1,7 @@
 """Signals over time in a browser: a log and what models make of it, a simulated run, and what a watch saw."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,14 +54,14 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     """
     units = _units(summary)
     frame = trace.assign(**_turns(trace, units))
-    if _is_run(summary):
+    if "single_run" in summary:
         frame = frame.assign(**_errors(frame)).rename(columns={"z": "twist"})
     coordinates = list(_coordinates(frame, units))
-    if "alarm_gap" in summary:
-        groups = list(_watch_groups(summary, frame))
+    is_watch = "alarm_gap" in summary
+    asked = _watch_groups(summary, frame) if is_watch else _groups(summary, frame, units)
+    groups = [group for group in asked if group["lines"]]
+    if is_watch:
         coordinates += [group["lines"][0] | {"unit": group["unit"]} for group in groups]
-    else:
-        groups = [group for group in _groups(summary, frame, units) if group["lines"]]
     if not groups:
         raise InputError(
             "explore: trace.parquet has no column that the page could draw; run the command that wrote it again"
@@ -72,9 +73,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         write(frame)
     return {
         "rows": len(frame),
-        "period": summary.get("every")
-        or summary.get("sample_period")
-        or float(np.median(np.diff(frame["t"].to_numpy(float)))),
+        "period": summary.get("every") or summary.get("sample_period") or float(np.median(np.diff(frame["t"]))),
         "held": "held_out" in frame and bool(frame["held_out"].any()),
         "coordinates": coordinates,
         "over": _first(summary, frame) or [line["column"] for line in coordinates[1:3]],
@@ -83,16 +82,18 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     }
 
 
-def _is_run(summary: JsonObject) -> bool:
-    return "single_run" in summary
-
-
-def _errors(trace: DataFrame) -> dict[str, np.ndarray]:
+def _errors(trace: DataFrame) -> JsonObject:
     """Compute what the observers of a simulated run are off by: true less observed."""
-    pairs = {f"{side}.{name}_error": (f"{side}.{name}", f"{side}.{name}_estimate")
-             for side in POSITION_CHANNELS for name in ("position", "velocity")}  # fmt: skip
-    columns = {name: pair for name, pair in pairs.items() if {*pair} <= {*trace}}
-    return {name: trace[true].to_numpy() - trace[estimate].to_numpy() for name, (true, estimate) in columns.items()}
+    names = [f"{side}.{name}" for side in POSITION_CHANNELS for name in ("position", "velocity")]
+    return {f"{name}_error": trace[name] - trace[f"{name}_estimate"] for name in names if f"{name}_estimate" in trace}
+
+
+def _group(
+    frame: DataFrame, name: str, quantity: str, unit: str, lines: Mapping[str, str], bandwidth: float | None = None
+) -> JsonObject:
+    """A figure: its quantity, and the columns that are there, each with a label."""
+    drawn = [{"column": column, "label": label} for column, label in lines.items() if column in frame]
+    return {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": drawn}
 
 
 def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
@@ -100,10 +101,8 @@ def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]
     for name, label in LABELS.items():
         columns = {f"{side}.{name}": f"by the {side} observer" for side in POSITION_CHANNELS}
         columns |= {f"{name}_{end}": f"{end}, with 95 %" for end in ("from", "to")}
-        lines = [{"column": column, "label": f"{label} {origin}"} for column, origin in columns.items() if column in frame]
-        if lines:
-            unit = summary["units"]["motor"][name]
-            yield {"name": label, "quantity": label, "unit": unit, "bandwidth": None, "lines": lines}
+        lines = {column: f"{label} {origin}" for column, origin in columns.items()}
+        yield _group(frame, label, label, summary["units"]["motor"][name], lines)
 
 
 def _units(summary: JsonObject) -> dict[str, str]:
@@ -119,12 +118,11 @@ def _force(unit: str) -> str:
 
 def _turns(trace: DataFrame, units: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Positions within a turn."""
-    turns = {
-        f"{side}.turn": within_turn(trace[name].to_numpy())
+    return {
+        f"{side}.turn": turns
         for side, name in POSITION_CHANNELS.items()
-        if name in trace and units[side] == "rad"
+        if name in trace and units[side] == "rad" and (turns := within_turn(trace[name].to_numpy())) is not None
     }
-    return {name: values for name, values in turns.items() if values is not None}
 
 
 def _coordinates(frame: DataFrame, units: Mapping[str, str]) -> Iterable[dict[str, str]]:
@@ -160,18 +158,17 @@ def _first(summary: JsonObject, frame: DataFrame) -> list[str]:
 
 
 def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> Iterable[JsonObject]:
-    """The figures of a log: each has a quantity, and its lines, the first two at the beginning."""
-
-    def group(name: str, quantity: str, unit: str, lines: Mapping[str, str], bandwidth: float | None = None) -> JsonObject:
-        drawn = [{"column": column, "label": label} for column, label in lines.items() if column in frame]
-        return {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": drawn}
-
-    law, speed = ("true", "true") if _is_run(summary) else ("by the fitted law", "smoothed")
+    """The figures of a log, the first two lines of each at the beginning."""
+    group = partial(_group, frame)
+    law, speed = ("true", "true") if "single_run" in summary else ("by the fitted law", "smoothed")
     bandwidths = summary.get("gap", {}).get("holdout", {}).get("bandwidth", {})
     last = summary["findings"][-1]["effect"] if summary.get("findings") else ""
     for side, unit in units.items():
         quantity = f"missing {missing_quantity(_force(unit))}"
-        lines = {f"{side}.missing_before": "model as given", f"{side}.missing_after": _AFTER if last else "numbers fitted"}
+        lines = {
+            f"{side}.missing_before": "model as given",
+            f"{side}.missing_after": "with the missing effects" if last else "numbers fitted",
+        }
         for column in map(str, frame):
             kind, _, effect = column.removeprefix(f"{side}.").partition(".")
             if kind == "missing_without":
@@ -198,6 +195,3 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
         lines = {f"{side}.velocity": speed, f"{side}.velocity_estimate": "by the observer"}
         if f"{side}.velocity_estimate" in frame:
             yield group(f"{side}: speed", "speed", f"{unit}/s", lines)
-
-
-_AFTER = "with the missing effects"

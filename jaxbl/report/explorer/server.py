@@ -6,7 +6,7 @@ import secrets
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -33,7 +33,7 @@ _POLICY = (
 
 
 @contextmanager
-def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
+def start_server(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
     """A server for results, which waits for `serve_forever`; its pages are removed at the end.
 
     Raises:
@@ -41,7 +41,7 @@ def served(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
     """
     with TemporaryDirectory(prefix="jaxbl-explore-") as place:
         try:
-            server = ExplorerServer(lambda out: source.write(out, True), source.answers, Path(place), port)
+            server = ExplorerServer(source, Path(place), port)
         except OSError as error:
             raise InputError(f"--port {port}: {error.strerror}; choose another one") from None
         with server:
@@ -63,9 +63,7 @@ class ExplorerServer(ThreadingHTTPServer):
     """Serves a page and answers its questions; `url` is what the browser opens.
 
     Args:
-        write: writes the page into an empty folder; says whether it is to be written again when it is loaded again.
-        answers: to a page's questions, by name: from what is asked to what is answered, as plain data. `InputError` is bad
-            input.
+        source: results; the page is written again when it is loaded again, if there is more to come.
         place: a folder for pages, which the caller removes.
         port: to be bound; 0 for any that is free.
 
@@ -75,15 +73,8 @@ class ExplorerServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(
-        self,
-        write: Callable[[Path], bool],
-        answers: Mapping[str, Callable[[Any], Mapping[str, Any]]],
-        place: Path,
-        port: int = 0,
-    ):
-        self.answers = answers
-        self._write, self._place = write, place
+    def __init__(self, source: Source, place: Path, port: int):
+        self.source, self._place = source, place
         self.token = secrets.token_urlsafe(24)
         self._lock, self._versions, self._stale = threading.Lock(), 0, True
         self._loaded: set[str] = set()
@@ -122,7 +113,7 @@ class ExplorerServer(ThreadingHTTPServer):
                 folder = self._place / str(self._versions + 1)
                 folder.mkdir()
                 try:
-                    self._stale = self._write(folder)
+                    self._stale = self.source.write(folder, True)
                 except BaseException:
                     shutil.rmtree(folder)
                     raise
@@ -184,7 +175,7 @@ class _Handler(BaseHTTPRequestHandler):
         if (parts := self._parts()) is None:
             return
         length = self.headers.get("Content-Length", "")
-        answer = self.server.answers.get(parts[-1]) if len(parts) == 2 else None
+        answer = self.server.source.answers.get(parts[-1]) if len(parts) == 2 else None
         if answer is None or self.headers.get_content_type() != "application/json":
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such question")
         elif not re.fullmatch(r"\d{1,9}", length) or int(length) > _MOST_ASKED:

@@ -23,12 +23,12 @@ def open_source(folder: str | Path) -> Source:
     results = ResultFolder.read(where)
     entries = {} if results is None else results.entries
     files = [where / name for name in _KINDS if any(name in entry["files"] for entry in entries.values())]
-    swept = [where / STUDY] if "sweep" in entries else []
-    if not files + swept:
+    files += [where / STUDY] * ("sweep" in entries)
+    if not files:
         raise InputError(f"{folder}: is missing, or holds no results; give a folder that {_COMMANDS} wrote")
     # of several commands that wrote into one folder the last one counts
-    newest = max(files + swept, key=lambda file: file.stat().st_mtime) if files else where / STUDY
-    if newest in swept:
+    newest = max(files, key=lambda file: file.stat().st_mtime) if len(files) > 1 else files[0]
+    if newest.name == STUDY:
         return study_source(where)
     # what its page says
     card = next((entries[name] for name in (newest.name, PAGE) if "title" in entries.get(name, {})), {})

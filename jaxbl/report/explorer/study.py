@@ -7,14 +7,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, is_boolean, read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
+from jaxbl.report.checks import has_words
 from jaxbl.report.error_plane import error_path, plane_reach
-from jaxbl.report.maps import value_label
+from jaxbl.report.maps import axis_words, value_label
 from jaxbl.report.panels import MAP, pack_numbers
 from jaxbl.report.sweep import answer_sweep
 from jaxbl.sweeps.metrics import is_magnitude
@@ -22,8 +24,7 @@ from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run, run_perturbed
 
-from .cloud import write_cloud
-from .folder import Source, colours_of, drawable, write_page
+from .folder import Source, colours_of, drawable, page_values, points_writer, write_page
 from .grid import dimensions, write_grid
 
 
@@ -105,12 +106,36 @@ def write_study(
     config = result.config
     content = _about(config, result.columns, studies) | {"lead": list(lead), "served": served}
     names = [metric["name"] for metric in content["metrics"]]
-    content |= (
-        write_cloud(result, names, out) if dimensions(config) is None else write_grid(result, names, content["first"], out)
-    )
+    dims = dimensions(config)
+    content |= write_cloud(result, names, out) if dims is None else write_grid(result, names, content["first"], out, dims)
     (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
     write_page(out, ("study", "runs", "views"), content, scripts=not served)
     return not result.is_finished(content["found"])
+
+
+def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> JsonObject:
+    """Write `points.parquet`, part by part, and return what the page says of it: axes as float64, of words their place in
+    `words`; metrics as float32.
+
+    Args:
+        result: a study; of an unfinished one, what is there.
+        metrics: columns that are kept.
+        out: folder.
+    """
+    config, rows = result.config, 0
+    words = {axis.path: list(axis.values or ()) for axis in config.axes if has_words(axis)}
+    types = dict.fromkeys([*config.axis_paths, "seed"], np.float64) | dict.fromkeys(metrics, np.float32)
+    with points_writer(out, types) as write:
+        for frame in result.batches():
+            places = {path: frame[path].map(values.index) for path, values in words.items()}
+            metric_values = {name: page_values(frame, name) for name in metrics}
+            write(frame.assign(**places, **metric_values))
+            rows += len(frame)
+    descriptions = [
+        axis_words(config, axis.path) | {"words": words.get(axis.path), "log": axis.scale == "log"} for axis in config.axes
+    ]
+    sampled = config.sweep.design != "grid"
+    return {"axes": descriptions, "rows": rows, "found": rows, "total": result.runs, "sampled": sampled}
 
 
 _MOST_SAMPLES = 20_000
