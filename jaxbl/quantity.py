@@ -62,15 +62,17 @@ class Quantity:
 
     def __str__(self) -> str:
         """Return value, standard error and unit: of the error the first digit, or two if that is a 1."""
-        texts = [f"{self.value:.5g}"]
-        if self.standard_error and self.is_finite:
+        # of a fit that is rejected a standard error says nothing
+        unknown = bool(self.interval) and all(map(math.isnan, self.interval or ()))
+        texts = [f"{self.value:.{3 if unknown else 5}g}"]
+        if self.standard_error and self.is_finite and not unknown:
             texts.append(f"{self.standard_error:.2g}")
             place = math.floor(math.log10(self.standard_error))
             decimals = (self.standard_error < 2.0 * 10.0**place) - place
             if abs(decimals) <= _DECIMALS:
                 numbers = self.value, self.standard_error
                 texts = [f"{round(number, decimals):.{max(decimals, 0)}f}" for number in numbers]
-        return f"{' ± '.join(texts)} {self.unit or ''}".rstrip()
+        return f"{' ± '.join(texts)} {self.unit or ''}".rstrip() + ", no interval" * unknown
 
 
 def _read_number(content: Any) -> Any:

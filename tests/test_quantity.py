@@ -43,6 +43,11 @@ def test_text_has_the_digits_that_the_error_leaves(value, error, unit, text):
     assert str(Quantity(value, error, unit=unit)) == text
 
 
+def test_a_number_of_a_fit_that_is_rejected_has_no_error_beside_it():
+    assert str(Quantity(0.0018, 3e-4, (math.nan, math.nan), "N m s/rad")) == "0.0018 N m s/rad, no interval"
+    assert str(Quantity(0.0018, 3e-4, (0.0012, math.nan), "N m s/rad")) == "0.0018 ± 0.0003 N m s/rad"
+
+
 @given(NUMBERS, st.floats(1e-12, 1e12))
 def test_text_is_within_an_error_of_the_number(value, error):
     shown, shown_error = str(Quantity(value, error)).split(" ± ")

@@ -86,8 +86,12 @@ def inspect(
             *guesses,
         ]
         write_atomic(write, "".join(f"# {escape_unprintable(remark)}\n" for remark in remarks) + tomli_w.dumps(study))
-        remarks = [f"{write}: a first model.", *guesses, *card.remarks]
-        card = replace(card, remarks=remarks, next_steps=after_proposal(log, write))
+        open_guesses = [guess for guess in guesses if "put in" in guess or "can name" in guess or "placeholder" in guess]
+        lead = f"{write}: a first model{'; fill in first: ' if open_guesses else '.'}{' '.join(open_guesses)}"
+        remarks = [lead, *(guess for guess in guesses if guess not in open_guesses), *card.remarks]
+        # without an input there is nothing to be fitted yet
+        steps = [] if "u" in study["log"].get("absent", ()) else after_proposal(log, write)
+        card = replace(card, remarks=remarks, next_steps=steps)
     with open_results(folder, log_subject(log), overwrite=overwrite) as results:
         # the terminal has no line left for it
         jaxbl.write_report(inspection, results, replace(card, next_steps=card.next_steps or after_inspection(log, model)))

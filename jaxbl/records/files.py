@@ -133,7 +133,7 @@ class LogFile:
                 f"no column '{column}': the file has no header; give the column's number, 0 to {len(names) - 1}"
                 + (f", as [log] {channel}" if channel else "")
             )
-        key = f"; [log] {channel} can name another" if channel else ""
+        key = f"; [log] {channel} can name another, and 'jaxbl inspect LOG --write NEW.toml' guesses all" if channel else ""
         unread = " ".join(["", *self.columns.describe_unread()])
         raise self.error(f"no column '{column}'; {suggest_word(column, map(str, names))}{key}{unread and '.' + unread}")
 

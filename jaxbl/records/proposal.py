@@ -102,7 +102,7 @@ def _guess_channel(name: str, unit: str) -> str:
         return "t"
     # an unknown unit fits any quantity
     fitting = [kind for kind, units in _CHANNEL_UNITS.items() if unit in units or unit not in _SPELLINGS]
-    if "u" in fitting and (_matches("u", name) or (not name and unit in ("mA", "A", "N m"))):
+    if "u" in fitting and (_matches("u", name) or unit in ("N m", "mN m") or (not name and unit in ("mA", "A"))):
         return "u"
     if _matches("omega", name) or unit in SPEED_FACTORS:
         return f"omega_{side}" if "omega" in fitting or unit == "counts" else ""
@@ -154,7 +154,9 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
     if "u" not in table:
         table["absent"] = ["u"]
-        guesses.append("No column looks like a torque: u is taken as not recorded.")
+        spare = [str(column) for column in file.columns if column not in [candidate.column for candidate in chosen.values()]]
+        choice = f"; [log] u can name one of: {', '.join(spare)}" if spare else ""
+        guesses.append(f"No column looks like a torque: u is taken as not recorded{choice}.")
     if "t" not in table:
         raise InputError(f"{path}: no column is called like a time; [log] t can name it, or give a period")
     return table, guesses
@@ -227,7 +229,7 @@ def _make_table(channel: str, candidate: _Candidate, guesses: list[str]) -> _Tab
         guesses.append(f"The unit of {quantity} is {fault}{assumed} is assumed.")
         keys = {} if channel == "u" else units[assumed]
     elif channel == "u" and "factor" in keys and unit != "mN m":
-        guesses.append(f"u.factor: put in the torque of one {unit}; 1 N m for each A or V, or for 100 %, is a placeholder.")
+        guesses.append(f"u.factor: put in the torque of one {unit} of the column; {keys['factor']:g} N m is a placeholder.")
     elif unit == "counts":
         guesses.append(f"{quantity} looks like counts: put in counts_per_turn; 4096 is a placeholder.")
     return {"column": column} | keys

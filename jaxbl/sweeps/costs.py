@@ -126,7 +126,7 @@ def load_costs(devices: Sequence[Any]) -> Costs:
         return _CPU
     costs = program_cache.load(key)
     if costs is None:
-        announce("measuring this machine")
+        announce("measuring the speed of this computer")
         costs = measure_costs(list(devices))
         program_cache.save(key, costs)
         announce("running")

@@ -24,7 +24,7 @@ def test_names_and_units_of_columns_are_understood(tmp_path):
         "u": {"column": "Motor current [mA]", "unit": "A", "factor": 1e-3},
         "theta_e": {"column": "position_deg", "unit": "deg"},
     }
-    assert guesses == ["u.factor: put in the torque of one mA; 1 N m for each A or V, or for 100 %, is a placeholder."]
+    assert guesses == ["u.factor: put in the torque of one mA of the column; 0.001 N m is a placeholder."]
 
 
 COLUMNS = {
@@ -57,6 +57,13 @@ COLUMNS = {
         "theta_e": "Rotorlage",
         "theta_s": "Abtriebswinkel",
     },
+    "zeit_s, M_soll_Nm, M_ist_Nm, phi_mot_rad, phi_abtrieb_rad": {
+        "t": "zeit_s",
+        "u": "M_ist_Nm",
+        "theta_e": "phi_mot_rad",
+        "theta_s": "phi_abtrieb_rad",
+    },
+    "zeit_s, M_soll_Nm, winkel_rad": {"t": "zeit_s", "u": "M_soll_Nm", "theta_e": "winkel_rad"},
     "ms, ticks, mA": {"t": "ms", "theta_e": "ticks", "u": "mA"},
     "t, DC Voltage [V], Torque In [Nm], Angle In [deg], Angle Out [deg]": {
         "u": "Torque In [Nm]",

@@ -97,8 +97,8 @@ def test_the_card_has_verdict_numbers_and_gap():
         "allow.",
     )
     assert result.key_figures == [
-        ("0.5 → 0.0055 N m", "motor: missing torque: rms error on held-out data (noise 0.005)"),
-        ("0.1 → 0.0011 rad", "motor position: rms error on held-out data (noise 0.001)"),
+        ("0.5 → 0.0055 N m", "motor: missing torque: rms error on held-out data (limit 0.006)"),
+        ("0.1 → 0.0011 rad", "motor position: rms error on held-out data (limit 0.0012)"),
         ("0.274 ± 0.002 N m", "load.coulomb_friction: torque"),
         ("0.93", "confidence that it is load.coulomb_friction"),
     ]

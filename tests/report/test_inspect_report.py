@@ -71,7 +71,7 @@ def test_the_card_fits_a_terminal_whatever_is_wrong(tmp_path):
     assert result.verdict == "doubtful" and len(result.details) > 3
     channels = result.tables[1]
     assert channels.columns[4:] == [
-        "resolution", "noise", "bandwidth (Hz)", "saturated", "jumps", "skew (ms)", "standard error"
+        "resolution", "noise", "bandwidth (Hz)", "saturated (share)", "jumps", "skew (ms)", "standard error (ms)"
     ]  # fmt: skip
     assert [row[0] for row in channels.rows] == list(inspection.record.statistics.channels)
 
