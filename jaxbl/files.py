@@ -86,10 +86,8 @@ def checksum(content: bytes) -> str:
 
 
 def read_json(path: Path) -> JsonObject:
-    """Read a JSON object that :func:`json_with_checksum` made, without its checksum.
-
-    Raises `DamagedFile` if it cannot be read, or does not agree with its checksum.
-    """
+    """Read a JSON object that :func:`json_with_checksum` made, without its checksum. Raises `DamagedFile` if it cannot be
+    read, or does not agree with its checksum."""
     try:
         data = json.loads(path.read_bytes())
         if data.pop("checksum") == _json_checksum(data):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from jaxbl.cluster import Cluster
 from jaxbl.errors import InputError
-from jaxbl.files import MANIFEST, is_remote, lock_folder, to_path
+from jaxbl.files import MANIFEST, lock_folder, to_path
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
@@ -93,10 +93,7 @@ class ClusterRun(StudyRun):
 
 
 def submit_chunks(cluster: Cluster, engine: Engine, store: Store) -> None:
-    """Have a cluster compute all missing chunks of a study, and wait for the first one only.
-
-    Raises as :class:`ClusterRun`.
-    """
+    """Have a cluster compute all missing chunks of a study, waiting for the first alone. Raises as :class:`ClusterRun`."""
     missing = [index for index in engine.chunk_order() if not store.has_part(index)]
     results = cluster.map_jobs(compute_bundle, _make_bundles(engine, store, missing[:1], 1))
     size = _bundle_size(sum(totals.run_seconds for totals, _ in results), len(missing[1:]), max(cluster.workers, 1))
@@ -112,8 +109,8 @@ def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
 
 def _make_bundles(engine: Engine, store: Store, chunks: Sequence[int | Chunk], size: int) -> Iterator[Bundle]:
     """Make bundles of `size` chunks each."""
-    folder = store.folder if is_remote(store.folder) else store.folder.absolute()
-    empty = Bundle(str(folder), store.manifest["identity"], store.layout, store.backend, engine.require_backend, ())
+    folder = str(store.folder.absolute())
+    empty = Bundle(folder, store.manifest["identity"], store.layout, store.backend, engine.require_backend, ())
     for first in range(0, len(chunks), size):
         yield empty._replace(chunks=tuple(chunks[first : first + size]))
 

@@ -228,10 +228,8 @@ class Store:
         return self.read_part(index, ()) is not None
 
     def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:
-        """Read columns of a chunk; None if its part is not stored. A damaged one is moved to `damaged/`.
-
-        Raises `InputError` if the part is of another study.
-        """
+        """Read columns of a chunk; None if its part is not stored. A damaged one is moved to `damaged/`. Raises `InputError`
+        if the part is of another study."""
         path, folder = self.part_path(index), self.folder / "damaged"
         try:
             return self._read(index, path, columns)
@@ -284,8 +282,7 @@ class Store:
         """Yield the rows of the stored parts, part by part; all columns, or only those named.
 
         Each file is compared with its checksum when it is read first, and each page whenever it is read. Raises
-        `InputError` if a part is damaged, or not of this study.
-        """
+        `InputError` if a part is damaged, or not of this study."""
         for index in self._indices_to_read():
             frame = self._read_whole(index, self._local_copy(index), columns, index not in self._checked)
             self._checked.add(index)
@@ -302,8 +299,7 @@ class Store:
         """The rows of the stored parts as a dataset of pyarrow, which compares each page that it reads with its checksum.
 
         With `check`, each file is first compared with its checksum; otherwise only headers are read. Raises as
-        :meth:`batches`.
-        """
+        :meth:`batches`."""
         from pyarrow import dataset
 
         indices = self._indices_to_read()
@@ -331,10 +327,8 @@ class Store:
         return copy
 
     def verify(self) -> int:
-        """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones.
-
-        Raises `InputError` if a part is of another study, or has an index that this study does not have.
-        """
+        """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones. Raises `InputError`
+        if a part is of another study, or has an index that this study does not have."""
         whole_parts = sum(map(self.has_part, self._indices_to_read()))
         if self.damaged:
             self.update_manifest(finished=False)
