@@ -64,8 +64,8 @@ clock(engine.Engine, "__init__", "points")
 clock(engine.Engine, "chunk_order", "order")
 # parts are written by a thread of their own
 clock(store.Store, "write_part", "write", time.thread_time)
-clock(store.Store, "has_part", "look")
-clock(run.Run, "finish", "finish")
+clock(store.Store, "read_part", "look")
+clock(run.StudyRun, "mark_finished", "finish")
 clock(sweep, "sweep", "sweep")
 clock(jaxbl.report.results, "write_report", "report")
 sys.argv = ["jaxbl", *sys.argv[1:]]

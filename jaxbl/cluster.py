@@ -62,12 +62,12 @@ class Cluster:
 
     @property
     def workers(self) -> int:
-        """Number of workers, at least one: a cluster may start them as they are needed."""
+        """Number of workers; 0 where a cluster starts them as they are needed."""
         try:
-            workers: Any = self._client.nthreads()
+            threads: Any = self._client.nthreads()
         except OSError:
             raise NoResult(_LOST) from None
-        return max(len(workers), 1)
+        return len(threads)
 
     def map_jobs(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
         """Results of a function (importable by name), in the order of its arguments."""
@@ -94,19 +94,20 @@ class Cluster:
 
         waiting, begun = iter(jobs), {}
         finished = as_completed(loop=self._client.loop)
-        most, counted, last_worker = 0, -_COUNT_SECONDS, time.monotonic()
+        most, next_count, last_worker = 0, 0.0, time.monotonic()
         try:
             while True:
                 if self._client.status != "running":
                     raise NoResult(_LOST)
-                if time.monotonic() - counted > _COUNT_SECONDS:
-                    most, counted = max(_AHEAD * self.workers, _FEWEST_AHEAD), time.monotonic()
-                if self._client.nthreads():
-                    last_worker = time.monotonic()
-                elif time.monotonic() - last_worker > _WORKERS_SECONDS:
-                    raise NoResult(f"no worker has come for {format_duration(_WORKERS_SECONDS)}; {_KEPT}")
-                else:
-                    announce("waiting for workers: the scheduler has none")
+                if (now := time.monotonic()) >= next_count:
+                    workers, next_count = self.workers, now + _COUNT_SECONDS
+                    most = max(_AHEAD * workers, _FEWEST_AHEAD)
+                    if workers:
+                        last_worker = now
+                    elif now - last_worker > _WORKERS_SECONDS:
+                        raise NoResult(f"no worker has come for {format_duration(_WORKERS_SECONDS)}; {_KEPT}")
+                    else:
+                        announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
                 begun |= {future.key: (name, future) for future, (name, _) in zip(futures, more, strict=True)}
@@ -191,19 +192,9 @@ def connect(scheduler: Scheduler) -> Iterator[Cluster | None]:
     if not isinstance(scheduler, str):
         yield Cluster(scheduler, local=False)
         return
-    kind, _, number = scheduler.partition(":")
-    if kind == "local":
-        if not number.isdecimal() or not 1 <= int(number) <= 1024:
-            raise InputError(f"--scheduler {scheduler}: local:N needs the number of processes, 1 to 1024")
-        if int(number) > (most := max(_LOCAL_A_CORE * count_cores(), _FEWEST_LOCAL)):
-            raise InputError(f"--scheduler {scheduler}: {count_cores()} cores keep at most {most} processes busy")
-        check_cost(f"--scheduler {scheduler}", int(number) * _WORKER_BYTES, "it should be fewer processes")
-        with _local(int(number)) as client:
-            yield Cluster(client, local=True)
-        return
-    announce(f"waiting for the scheduler {scheduler}")
-    with _open_client(scheduler) as client:
-        yield Cluster(client, local=False)
+    local = scheduler.partition(":")[0] == "local"
+    with _start_local(scheduler) if local else _open_client(scheduler) as client:
+        yield Cluster(client, local=local)
 
 
 def _open_client(scheduler: str) -> "Client":
@@ -213,24 +204,24 @@ def _open_client(scheduler: str) -> "Client":
     """
     from distributed import Client
 
-    outcome: list[Any] = []
+    announce(f"waiting for the scheduler {scheduler}")
+    outcomes: list[Any] = [TimeoutError("nothing for as long as a scheduler takes")]
 
     def open_client() -> None:
         try:
             address = str(json.loads(Path(scheduler).read_text())["address"]) if scheduler.endswith(".json") else scheduler
-            outcome.append(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
+            outcomes.append(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
         # whatever answers there, it is no scheduler
         except Exception as error:
-            outcome.append(error)
+            outcomes.append(error)
 
     thread = threading.Thread(target=open_client, name="jaxbl-connect", daemon=True)
     thread.start()
     thread.join(_ANSWER_SECONDS + 3.0)
-    if outcome and isinstance(outcome[0], Client):
-        return outcome[0]
-    fault = "nothing for as long as a scheduler takes"
-    if outcome:
-        fault = repr(outcome[0]) if isinstance(outcome[0], KeyError) else str(outcome[0])
+    outcome = outcomes[-1]
+    if isinstance(outcome, Client):
+        return outcome
+    fault = repr(outcome) if isinstance(outcome, KeyError) else str(outcome)
     raise InputError(
         f"--scheduler {scheduler}: no Dask scheduler answers there ({shorten(fault.partition(chr(10))[0], 120)}); "
         "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
@@ -238,14 +229,20 @@ def _open_client(scheduler: str) -> "Client":
 
 
 @contextmanager
-def _local(count: int) -> "Iterator[Client]":
-    """Processes of this machine as workers; they share its cores, and keys that no other user of the machine has.
+def _start_local(scheduler: str) -> "Iterator[Client]":
+    """Start processes of this machine as workers; they share its cores, and keys that no other user of the machine has.
 
     A scheduler runs the code that it is sent: without keys, that of whoever reaches its port.
     """
     from dask import config
     from distributed import Client, LocalCluster, Security
 
+    number = scheduler.removeprefix("local:")
+    if not number.isdecimal() or not 1 <= (count := int(number)) <= 1024:
+        raise InputError(f"--scheduler {scheduler}: local:N needs the number of processes, 1 to 1024")
+    if count > (most := max(_LOCAL_A_CORE * count_cores(), _FEWEST_LOCAL)):
+        raise InputError(f"--scheduler {scheduler}: {count_cores()} cores keep at most {most} processes busy")
+    check_cost(f"--scheduler {scheduler}", count * _WORKER_BYTES, "it should be fewer processes")
     try:
         security = Security.temporary()
     except ImportError:

@@ -13,7 +13,7 @@ import stat
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -29,11 +29,7 @@ FORMAT = 5
 
 def to_path(name: str | Path) -> Path:
     """Return a folder by its name: a path, or the address of an object store (`s3://bucket/folder`), which has the methods
-    of a path that are needed here.
-
-    Raises:
-        InputError: a package for such addresses is missing.
-    """
+    of a path that are needed here. Raises `InputError` if it is no address, or a package for it is missing."""
     if "://" not in str(name):
         return Path(name)
     try:
@@ -90,11 +86,8 @@ def checksum(content: bytes) -> str:
 
 
 def read_json(path: Path) -> JsonObject:
-    """Read a JSON object that :func:`json_with_checksum` made, without its checksum.
-
-    Raises:
-        DamagedFile: it cannot be read, or does not agree with its checksum.
-    """
+    """Read a JSON object that :func:`json_with_checksum` made, without its checksum. Raises `DamagedFile` if it cannot be
+    read, or does not agree with its checksum."""
     try:
         data = json.loads(path.read_bytes())
         if data.pop("checksum") == _json_checksum(data):
@@ -119,23 +112,20 @@ def _json_checksum(data: JsonObject) -> str:
 
 
 def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
-    """Write a file so that it exists either whole or not at all.
-
-    Raises:
-        NoResult: the disk is full, access is denied, or the disk fails.
-    """
+    """Write a file so that it exists either whole or not at all. Raises as :func:`catch_write_errors`."""
     # file names in the text may have bytes that are no UTF-8; they are escaped as JSON escapes them
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
-    draft = path if is_remote(path) else path.with_name(f".{path.name}.{os.getpid()}")
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
     with catch_write_errors(path):
+        if is_remote(path):
+            path.write_bytes(data)
+            return
         try:
             draft.write_bytes(data)
-            if draft != path:
-                draft.replace(path)
+            draft.replace(path)
         except BaseException:
             with suppress(OSError):
-                if draft != path:
-                    draft.unlink()
+                draft.unlink()
             raise
 
 
@@ -176,11 +166,8 @@ def move_file(path: Path, target: Path) -> None:
 
 @contextmanager
 def catch_write_errors(path: Path) -> Iterator[None]:
-    """Turn errors of writing into a file or folder, inside the `with` block, into one line.
-
-    Raises:
-        NoResult: the disk is full, access is denied, or the disk fails.
-    """
+    """Turn errors of writing into a file or folder, inside the `with` block, into a `NoResult`: the disk is full, access
+    is denied, or the disk fails."""
     try:
         yield
     except OSError as error:
@@ -354,48 +341,27 @@ def _try_lock_bytes(file: Any, shared: bool) -> bool:
 
 def _remove_drafts(folder: Path) -> None:
     """Remove the drafts that killed processes have left in a folder that is locked."""
-    for place in (folder, *(folder / name for name in ("points", "verify", "tune"))):
-        for draft in list_paths(place, ".*"):
+    for place in ("", "points", "verify", "tune"):
+        for draft in list_paths(folder / place, ".*"):
             if _DRAFT_NAME.fullmatch(draft.name):
                 remove(draft)
 
 
-def is_empty(folder: Path) -> bool:
-    """True if a folder contains at most a lock."""
-    return all(path.name == _LOCK_NAME for path in list_paths(folder, "*"))
-
-
 @contextmanager
 def catch_store_errors(path: Path, action: str) -> Iterator[None]:
-    """Turn any error of an object store, inside the `with` block, into an `InputError` of one line.
-
-    `action` completes the sentence "... cannot be ...", e.g. "read".
-    """
+    """Turn any error of an object store, inside the `with` block, into an `InputError`: the path cannot be read, say."""
     try:
         yield
     except Exception as error:  # each store has exceptions of its own
+        if not is_remote(path):
+            raise
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(f"{path}: cannot be {action} ({reason}); name another folder, or mend the access to it") from None
 
 
-def has_file(folder: Path, name: str) -> bool:
-    """True if a file is in a folder. Raises `InputError` if an object store cannot be read."""
-    if is_remote(folder):
-        with catch_store_errors(folder, "read"):
-            return (folder / name).exists()
-    return (folder / name).exists()
-
-
 def make_folder(path: Path, remedy: str = "choose another folder with --out") -> None:
-    """Make a folder, and check that it can be written to.
-
-    Args:
-        path: the folder, which may exist.
-        remedy: the end of the message.
-
-    Raises:
-        InputError: it cannot be made, or not be written to.
-    """
+    """Make a folder, which may exist, and check that it can be written to. Raises `InputError`, which ends with the remedy,
+    if that is not possible."""
     if is_remote(path):
         with catch_store_errors(path, "written to"):
             (path / ".probe").write_bytes(b"")
@@ -453,8 +419,9 @@ class ResultFolder:
     @classmethod
     def read(cls, path: Path) -> "ResultFolder | None":
         """Read the manifest of a folder; None if it has none. Raises `InputError` if it is damaged, or of another format."""
-        if not has_file(path, MANIFEST):
-            return None
+        with catch_store_errors(path, "read"):
+            if not (path / MANIFEST).exists():
+                return None
         data = read_json(path / MANIFEST)
         names = [name for entry in data.get("results", {}).values() for name in (*entry["files"], *entry.get("folders", ()))]
         if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in names):
@@ -474,13 +441,9 @@ class ResultFolder:
     def is_whole(self, result: str, identity: str) -> bool:
         """Return True if a result is there, is what was asked for, and none of its files has changed."""
         entry = self.entries.get(result, {})
-        return entry.get("identity") == identity and not self.damaged_files(result)
-
-    def damaged_files(self, result: str) -> list[str]:
-        """List the names of a result's files that are not what was written."""
-        return [
-            name for name, expected in self.entries[result]["files"].items() if file_checksum(self.path / name) != expected
-        ]
+        return entry.get("identity") == identity and all(
+            file_checksum(self.path / name) == expected for name, expected in entry["files"].items()
+        )
 
     def check_file(self, name: str) -> Path:
         """Return the path of a result's file that is what was written. Raises `InputError` otherwise."""
@@ -521,9 +484,7 @@ def file_checksum(path: Path) -> str:
 
 def recover_log(folder: Path) -> ResultFolder | None:
     """Return the folder of a log whose manifest is lost or damaged, by a summary that names the log; None without one.
-
-    Nothing in it counts as whole: it is made anew.
-    """
+    All in it is made anew."""
     for file in list_paths(folder, "*.json"):
         with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
             return ResultFolder(folder, log_subject(Path(json.loads(file.read_bytes())["file"])))
@@ -535,7 +496,7 @@ def claim_folder(
     subject: Subject,
     *,
     overwrite: bool = False,
-    identities: Mapping[str, str] | None = None,
+    asked: Iterable[tuple[str, str]] = (),
     recover: Callable[[Path], ResultFolder | None] = recover_log,
 ) -> ResultFolder:
     """Check that results may be written into a folder, which is locked (:func:`lock_folder`).
@@ -544,28 +505,29 @@ def claim_folder(
         folder: folder of the results.
         subject: what they are about.
         overwrite: remove results of another subject.
-        identities: of results by name; others of these names are not written over, either.
+        asked: names and identities of results; others of these names are not written over, either.
         recover: finds out what a folder holds whose manifest is lost or damaged.
 
     Raises:
         InputError: the folder holds other results or other files, or its manifest is damaged.
     """
+    results = fault = None
     try:
-        results = ResultFolder.read(folder) or recover(folder)
-        if results is None and not is_empty(folder):
+        results = ResultFolder.read(folder)
+    except InputError as error:
+        fault = error
+    results = results or recover(folder)
+    if results is None:
+        if fault and not (overwrite and isinstance(fault, DamagedFile)):
+            raise fault
+        if not fault and any(path.name != _LOCK_NAME for path in list_paths(folder, "*")):
             raise InputError(
                 f"{folder}: is not empty and holds no results with a {MANIFEST} (an earlier jaxbl wrote none there); choose "
                 "another folder with --out, where they are made anew"
             )
-    except InputError as error:
-        results = recover(folder)
-        if results is None and not (overwrite and isinstance(error, DamagedFile)):
-            raise
-    if results is None:
         remove(folder / MANIFEST)
         return ResultFolder(folder, subject)
-    asked = identities or {}
-    same = all(results.entries.get(name, {}).get("identity") in (None, value) for name, value in asked.items())
+    same = all(results.entries.get(name, {}).get("identity") in (None, identity) for name, identity in asked)
     if same and (results.subject.kind, results.subject.identity) == (subject.kind, subject.identity):
         return results
     if not overwrite:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from jaxbl.cluster import Cluster
 from jaxbl.errors import InputError
-from jaxbl.files import MANIFEST, is_remote, lock_folder, to_path
+from jaxbl.files import MANIFEST, lock_folder, to_path
 from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
@@ -52,13 +52,6 @@ class Bundle(NamedTuple):
     chunks: tuple[int | Chunk, ...]
 
 
-class _BundleResult(NamedTuple):
-    """Totals of the run of a bundle, and the worker's host."""
-
-    totals: RunTotals
-    host: str
-
-
 class ClusterRun(StudyRun):
     """A run whose chunks are computed by a cluster's workers.
 
@@ -73,28 +66,22 @@ class ClusterRun(StudyRun):
         self._next_poll = time.monotonic() + _POLL_SECONDS
 
     def compute_missing(self, chunks: Iterable[Chunk]) -> None:
-        missing: list[int | Chunk] = []
-        for chunk in chunks:
-            if self.has_chunk(chunk):
-                self.count_chunk(chunk)
-            else:
-                # the points of all chunks would be 8 GB in a study of 10^9
-                missing.append(chunk.index if self.engine.points.refinement is None else chunk)
+        # the points of all chunks would be 8 GB in a study of 10^9
+        missing = [chunk.index if self.engine.points.refinement is None else chunk for chunk in self.missing_chunks(chunks)]
         # the first chunks, one for each worker, show how long a chunk takes
-        first, before = self._cluster.workers, self.totals.run_seconds
-        self._compute_bundles(missing[:first], 1)
-        size = _bundle_size((self.totals.run_seconds - before) / first, len(missing[first:]), self._cluster.workers)
-        self._compute_bundles(missing[first:], size)
+        workers, before = max(self._cluster.workers, 1), self.totals.run_seconds
+        self._compute_bundles(missing[:workers], 1)
+        size = _bundle_size((self.totals.run_seconds - before) / workers, len(missing[workers:]), workers)
+        self._compute_bundles(missing[workers:], size)
 
     def _compute_bundles(self, chunks: Sequence[int | Chunk], size: int) -> None:
         """Have workers compute chunks, in bundles of a size."""
-        bundles = _make_bundles(self.engine, self.store, chunks, size)
-        named_jobs = ((bundle, bundle) for bundle in bundles)
-        for bundle, result in self._cluster.run_jobs(compute_bundle, named_jobs, self._poll_parts):
+        jobs = ((bundle, bundle) for bundle in _make_bundles(self.engine, self.store, chunks, size))
+        for bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, jobs, self._poll_parts):
             for chunk in _chunks_of(self.engine, bundle):
-                _wait_for_part(self.store.part_path(chunk.index), result.host)
+                _wait_for_part(self.store.part_path(chunk.index), host)
                 self.count_chunk(chunk)
-            self.worker_totals += result.totals
+            self.worker_totals += totals
 
     def _poll_parts(self) -> None:
         """Report progress by the number of stored parts, since a bundle takes long."""
@@ -106,15 +93,10 @@ class ClusterRun(StudyRun):
 
 
 def submit_chunks(cluster: Cluster, engine: Engine, store: Store) -> None:
-    """Have a cluster compute all missing chunks of a study, and wait for the first one only.
-
-    Raises as :class:`ClusterRun`.
-    """
+    """Have a cluster compute all missing chunks of a study, waiting for the first alone. Raises as :class:`ClusterRun`."""
     missing = [index for index in engine.chunk_order() if not store.has_part(index)]
-    seconds = 0.0
-    for result in cluster.map_jobs(compute_bundle, _make_bundles(engine, store, missing[:1], 1)):
-        seconds = result.totals.run_seconds
-    size = _bundle_size(seconds, len(missing[1:]), cluster.workers)
+    results = cluster.map_jobs(compute_bundle, _make_bundles(engine, store, missing[:1], 1))
+    size = _bundle_size(sum(totals.run_seconds for totals, _ in results), len(missing[1:]), max(cluster.workers, 1))
     cluster.submit_jobs(compute_bundle, list(_make_bundles(engine, store, missing[1:], size)))
 
 
@@ -127,8 +109,8 @@ def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
 
 def _make_bundles(engine: Engine, store: Store, chunks: Sequence[int | Chunk], size: int) -> Iterator[Bundle]:
     """Make bundles of `size` chunks each."""
-    folder = store.folder if is_remote(store.folder) else store.folder.absolute()
-    empty = Bundle(str(folder), store.manifest["identity"], store.layout, store.backend, engine.require_backend, ())
+    folder = str(store.folder.absolute())
+    empty = Bundle(folder, store.manifest["identity"], store.layout, store.backend, engine.require_backend, ())
     for first in range(0, len(chunks), size):
         yield empty._replace(chunks=tuple(chunks[first : first + size]))
 
@@ -150,8 +132,8 @@ def _wait_for_part(part: Path, host: str) -> None:
         time.sleep(0.2)
 
 
-def compute_bundle(bundle: Bundle) -> _BundleResult:
-    """Compute the chunks of a bundle that are not stored; called on a worker."""
+def compute_bundle(bundle: Bundle) -> tuple[RunTotals, str]:
+    """Compute the chunks of a bundle that are not stored; called on a worker. Returns totals, and the worker's host."""
     folder, host = to_path(bundle.folder), socket.gethostname()
     if not (folder / MANIFEST).exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
@@ -163,7 +145,7 @@ def compute_bundle(bundle: Bundle) -> _BundleResult:
         engine.compile_seconds = engine.run_seconds = 0.0
         run = StudyRun(engine, store)
         run.compute_missing(_chunks_of(engine, bundle))
-    return _BundleResult(run.totals, host)
+    return run.totals, host
 
 
 @functools.lru_cache(maxsize=2)

@@ -71,7 +71,7 @@ def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool =
 
     Args:
         path: the file.
-        columns: names of columns; left out, all.
+        columns: names of columns; left out, all; with `()`, the header alone is read.
         check: read the whole file first, and compare it with its checksum; otherwise only pages are compared with theirs.
 
     Raises:
@@ -83,7 +83,6 @@ def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool =
         source = BytesIO(_read_checked(path)) if check or is_remote(path) else path.open("rb")
         with source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             header = json.loads((file.schema_arrow.metadata or {})[_KEY])
-            # no columns: the header alone
             frame = pd.DataFrame() if columns == () else file.read(columns=columns).to_pandas()
             return PartHeader(**header), frame
     except FileNotFoundError:
@@ -95,10 +94,9 @@ def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool =
 
 def _read_checked(path: Path) -> bytes:
     """Read a file whose checksum is right."""
-    if is_remote(path) and path.exists():
-        with catch_store_errors(path, "read"):
-            content = path.read_bytes()
-    else:
+    if is_remote(path) and not path.exists():
+        raise FileNotFoundError(path)
+    with catch_store_errors(path, "read"):
         content = path.read_bytes()
     place, checksum = _checksum(content)
     if _SUM not in content:

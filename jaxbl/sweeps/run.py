@@ -1,9 +1,8 @@
 """Computes the chunks of a study that are not stored yet."""
 
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,22 +29,16 @@ def open_or_create_store(folder: Path, engine: Engine, *, overwrite: bool = Fals
 
     Args:
         folder: study's folder, locked by this process.
-        engine: engine that this machine would use; if it requires its backend, a store of another one is refused.
+        engine: engine that this machine would use.
         overwrite: remove the results of other studies from the folder.
 
     Raises:
-        InputError: the folder holds another study, or a store of another backend.
+        InputError: the folder holds another study, or a store of another backend than the one that the engine requires.
     """
-    config = engine.config
-    results = claim_study(folder, config, overwrite=overwrite)
-    store = Store.create(results, config, engine.layout, engine.backend, len(engine), engine.rows)
-    engine = _match_engine(store, engine)
-    if engine.points.refinement is not None:
-        store.restore_part_count()
-    elif store.manifest["parts"] != len(engine):
-        # the manifest was lost, and written anew for chunks of another shape
-        store.update_manifest(parts=len(engine))
-    return engine, store
+    results = claim_study(folder, engine.config, overwrite=overwrite)
+    if "sweep" in results.entries:
+        engine = _match_engine(Store(results), engine)
+    return engine, Store.create(results, engine)
 
 
 def _match_engine(store: Store, engine: Engine) -> Engine:
@@ -65,23 +58,16 @@ def join_store(folder: Path, engine: Engine) -> Iterator[tuple[Engine, Store]]:
 
     Yields an engine with the store's layout and backend, and the store. Raises as :func:`open_or_create_store`.
     """
-    deadline = time.monotonic() + _PREPARATION_SECONDS
     while True:
+        # where another process prepares the folder, this one waits
         with suppress(FolderInUse), lock_folder(folder):
             open_or_create_store(folder, engine)
-        with ExitStack() as lock:
-            try:
-                lock.enter_context(lock_folder(folder, shared=True))
-            except FolderInUse:
-                # another process prepares the folder, or has it for itself
-                if time.monotonic() > deadline:
-                    raise
-            else:
-                claim_study(folder, engine.config)
+        with lock_folder(folder, shared=True, wait=_PREPARATION_SECONDS):
+            # without the entry, the process that prepared the folder has been ended
+            if "sweep" in claim_study(folder, engine.config).entries:
                 store = Store.open(folder)
                 yield _match_engine(store, engine), store
                 return
-        time.sleep(0.1)
 
 
 class RunTotals(NamedTuple):
@@ -160,7 +146,7 @@ class StudyRun:
         for group in range(len(self.engine.points.groups)):
             self._refine(group)
         if self._store is not None:
-            self._store.set_final_totals(self._chunks, self._total)
+            self._store.set_totals(self._chunks, self._total, final=True)
 
     def mark_finished(self) -> None:
         """Write into the manifest that all parts are stored."""
@@ -172,30 +158,31 @@ class StudyRun:
         """Compute the coarse grid of a group, and the points that refine its boundaries."""
         assert self.engine.points.refinement is not None
         _, grid, criterion = self.engine.points.refinement
-        columns, seeds = list(criterion.columns), self.engine.config.sweep.seeds
+        columns, sweep = list(criterion.columns), self.engine.config.sweep
         counted = self.engine.points.coarse_size
 
         def evaluate(points: np.ndarray) -> np.ndarray:
             nonlocal counted
             # the totals count the coarse grid from the start
-            self._total += (len(points) - counted) * seeds
+            self._total += (len(points) - counted) * sweep.seeds
             self._chunks += self.engine.count_chunks(len(points)) - self.engine.count_chunks(counted)
             counted = 0
             if self._store is not None:
-                self._store.raise_totals(self._chunks, self._total)
+                self._store.set_totals(self._chunks, self._total)
             chunks = self.engine.split_points(group, points, self._next)
             self._next += len(chunks)
             self.compute_missing(chunks)
-            values = np.empty((seeds, len(points), len(columns)))
-            row = column = 0
+            values = np.empty((len(points), sweep.seeds, len(columns)))
             for chunk in chunks:
-                shape = (*chunk.shape, len(columns))
-                metrics = self._read_columns(chunk, columns)[columns].to_numpy(float).reshape(shape)
-                values[row : row + shape[0], column : column + shape[1]] = metrics
-                column += shape[1]
-                if column == len(points):
-                    row, column = row + shape[0], 0
-            return values.swapaxes(0, 1)
+                frame = self._read_chunk(chunk, *columns)
+                if frame is None:
+                    raise InputError(
+                        f"{self.store.part_path(chunk.index)}: was changed by another process; run the same command again"
+                    )
+                metrics = frame[columns].to_numpy(float).reshape(*chunk.shape, len(columns))
+                lanes = np.ix_(np.searchsorted(points, chunk.points), chunk.seeds - sweep.first_seed)
+                values[lanes] = metrics.swapaxes(0, 1)
+            return values
 
         refine_boundary(grid, evaluate, criterion.disagree)
 
@@ -204,48 +191,40 @@ class StudyRun:
 
         If an interrupt ends this, the chunks that were computed are written first.
         """
-        written: tuple[Chunk, Future[None]] | None = None
+        write = self._frames.__setitem__ if self._store is None else self._store.write_part
+        computed: tuple[Chunk, Future[None]] | None = None
         with ThreadPoolExecutor(1) as writer:
-            for chunk in chunks:
-                if self.has_chunk(chunk):
-                    self.count_chunk(chunk)
-                    continue
+            for chunk in self.missing_chunks(chunks):
                 frame = self.engine.run(chunk)
                 self._lanes += len(frame)
-                if self._store is None:
-                    self._frames[chunk.index] = frame
-                    self.count_chunk(chunk)
-                    continue
-                before, written = written, (chunk, writer.submit(self._store.write_part, chunk.index, frame))
+                before, computed = computed, (chunk, writer.submit(write, chunk.index, frame))
                 # frames are large: at most one waits to be written
                 self._await_part(before)
-            self._await_part(written)
+            self._await_part(computed)
 
-    def _await_part(self, written: tuple[Chunk, Future[None]] | None) -> None:
+    def _await_part(self, computed: tuple[Chunk, Future[None]] | None) -> None:
         """Wait until the part of a chunk is written, and count the chunk."""
-        if written is not None:
-            chunk, end = written
+        if computed is not None:
+            chunk, end = computed
             end.result()
             self.count_chunk(chunk)
 
-    def has_chunk(self, chunk: Chunk) -> bool:
-        """True if the part of a chunk is stored and whole; in a refined study also only if it has the chunk's points."""
-        if self._store is None or not self._store.has_part(chunk.index):
-            return False
-        return self.engine.points.refinement is None or self._read_part(chunk, []) is not None
+    def missing_chunks(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Yield the chunks that are not stored, and count the others as done."""
+        for chunk in chunks:
+            if self._read_chunk(chunk) is None:
+                yield chunk
+            else:
+                self.count_chunk(chunk)
 
-    def _read_part(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame | None:
-        return self.store.read_part(chunk.index, self.engine.row_labels(chunk), columns)
-
-    def _read_columns(self, chunk: Chunk, columns: list[str]) -> pd.DataFrame:
-        """Read columns of a chunk that is computed."""
+    def _read_chunk(self, chunk: Chunk, *columns: str) -> pd.DataFrame | None:
+        """Read columns of a chunk; None if it is not stored, or if the part of a refined study has other points."""
         if self._store is None:
-            return self._frames[chunk.index]
-        frame = self._read_part(chunk, columns)
-        if frame is None:
-            raise InputError(
-                f"{self._store.part_path(chunk.index)}: was changed by another process; run the same command again"
-            )
+            return self._frames.get(chunk.index)
+        labels = {} if self.engine.points.refinement is None else self.engine.row_labels(chunk)
+        frame = self._store.read_part(chunk.index, (*labels, *columns))
+        if frame is None or any(not np.array_equal(frame[name].to_numpy(), column) for name, column in labels.items()):
+            return None
         return frame
 
     def count_chunk(self, chunk: Chunk) -> None:

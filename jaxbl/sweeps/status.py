@@ -56,9 +56,9 @@ def status(folder: str | Path) -> Status:
     """Return the progress of the study in a folder. Raises `InputError` if there is none."""
     folder = to_path(folder)
     store = Store.open(folder)
-    times = np.sort([path.stat().st_mtime for path in store.list_part_files()])
-    recent = times[times > times[-1] - _RATE_SECONDS] if len(times) else times
-    span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+    times = np.array([path.stat().st_mtime for path in store.list_part_files()])
+    recent = times[times > times.max(initial=0.0) - _RATE_SECONDS]
+    span = float(np.ptp(recent)) if len(recent) else 0.0
     return Status(
         folder=folder,
         title=store.manifest["title"] or "untitled",
@@ -68,16 +68,13 @@ def status(folder: str | Path) -> Status:
         finished=store.manifest["finished"],
         damaged=len(list_paths(folder / "damaged", "*")),
         held_by=lock_holder(folder),
-        parts_per_second=float((len(recent) - 1) / span) if span > 0.0 else 0.0,
+        parts_per_second=(len(recent) - 1) / span if span else 0.0,
     )
 
 
 def list_statuses(folder: str | Path) -> list[Status]:
-    """Return the progress of the study in a folder, and of the stages that `verify` and `tune` run for it.
-
-    Raises:
-        InputError: the folder holds no study.
-    """
+    """Return the progress of the study in a folder, and of the stages that `verify` and `tune` run for it. Raises
+    `InputError` if the folder holds no study."""
     folder = to_path(folder)
     studies = [path.parent for command in ("verify", "tune") for path in list_paths(folder, f"{command}/*/{MANIFEST}")]
     # the folder of verify or tune has no points of its own

@@ -8,8 +8,8 @@ import shutil
 import tempfile
 import tomllib
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -19,7 +19,6 @@ import jax
 import numpy as np
 import pandas as pd
 
-from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import (
@@ -42,6 +41,8 @@ from .programs import Backend, Layout
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
+
+    from .engine import Engine
 
 STUDY, FOLDERS = "study.toml", ("points", "damaged")
 """Names in a study's folder: of its config, and of the folders with its parts."""
@@ -94,8 +95,8 @@ def study_head(config: Config, command: str = "sweep") -> JsonObject:
 
 def claim_study(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> ResultFolder:
     """Claim a locked folder for a command on a study (:func:`jaxbl.files.claim_folder`)."""
-    asked = {} if command == "simulate" else {command: identity(config, command)}
-    return claim_folder(folder, study_subject(config), overwrite=overwrite, identities=asked, recover=_recover_study)
+    asked = () if command == "simulate" else [(command, identity(config, command))]
+    return claim_folder(folder, study_subject(config), overwrite=overwrite, asked=asked, recover=_recover_study)
 
 
 def load_config(folder: Path) -> Config:
@@ -115,20 +116,9 @@ def _recover_study(folder: Path) -> ResultFolder | None:
         with suppress(Damaged, FileNotFoundError):
             study, layout, backend, _ = parts.read_part(path, ())[0]
             subject = Subject("study", study["title"] or "untitled", study["single_run"])
-            entry = {"identity": study["identity"], "layout": layout, "backend": backend, "files": {}, "folders": FOLDERS}
+            entry = study | {"layout": layout, "backend": backend, "finished": False, "files": {}, "folders": FOLDERS}
             return ResultFolder(folder, subject, {"sweep": entry})
     return None
-
-
-@contextmanager
-def _report_damage(part: Path) -> Iterator[None]:
-    """Raise `InputError` with a remedy if a part that is read inside is damaged."""
-    try:
-        yield
-    except Damaged as damage:
-        raise InputError(
-            f"{part}: is damaged ({damage}); run 'jaxbl sweep' again, which moves it to damaged/ and computes it anew"
-        ) from None
 
 
 class Store:
@@ -149,27 +139,15 @@ class Store:
         self._copy_folder: Path | None = None
 
     @classmethod
-    def create(
-        cls, results: ResultFolder, config: Config, layout: Layout, backend: Backend, chunks: int, rows: int
-    ) -> "Store":
-        """Open the store in a claimed folder (:func:`claim_study`), or create it.
-
-        Args:
-            results: claimed folder.
-            config: the study.
-            layout: seeds and points of a chunk, if no part exists.
-            backend: backend of all chunks, if no part exists.
-            chunks: number of chunks.
-            rows: number of rows of all chunks.
-        """
-        folder = results.path
-        before = results.entries.get("sweep", {})
+    def create(cls, results: ResultFolder, engine: "Engine") -> "Store":
+        """Open the store in a claimed folder, or create it. The engine has the layout and backend of parts that exist."""
+        folder, config, before = results.path, engine.config, results.entries.get("sweep", {})
         text = config.to_toml()
         results.entries["sweep"] = {
-            "layout": layout._asdict(),
-            "backend": backend,
-            "parts": chunks,
-            "rows": rows,
+            "layout": engine.layout._asdict(),
+            "backend": engine.backend,
+            "parts": len(engine),
+            "rows": engine.rows,
             "finished": False,
             "versions": {name: version(name) for name in ("jaxbl", "jax", "equinox", "llvmlite", "numpy")},
             "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},
@@ -178,12 +156,18 @@ class Store:
             "files": {STUDY: checksum(text.encode())},
             "folders": FOLDERS,
         }
+        store = cls(results)
+        store.manifest["parts"] = len(engine)
+        if engine.points.refinement is not None:
+            # the files are the only record of how many parts there were if the manifest was lost
+            last = max(map(store._index_of, store.list_part_files()), default=-1)
+            store.manifest["parts"] = max(len(engine), before.get("parts", 0), last + 1)
         # the manifest first: it reserves the folder for this study
         results.write_manifest()
         if not is_remote(folder):
             (folder / "points").mkdir(exist_ok=True)
         write_atomic(folder / STUDY, text)
-        return cls(results)
+        return store
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
@@ -216,103 +200,79 @@ class Store:
     def part_path(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
 
-    def has_part(self, index: int) -> bool:
-        """True if the part of a chunk is stored and whole; a damaged one is moved to `damaged/`.
+    def list_part_files(self) -> list[Path]:
+        """All files among the parts, whole or damaged, in the order of their indices."""
+        # names with six digits come after those with five
+        return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
 
-        Raises:
-            InputError: the part is of another study.
-        """
-        path = self.part_path(index)
-        try:
-            self._check_header(path, parts.read_part(path, ())[0], index)
-        except FileNotFoundError:
-            return False
-        except Damaged as damage:
-            self._move_to_damaged(path, str(damage))
-            return False
-        return True
+    def _index_of(self, path: Path) -> int:
+        """Index of the part in a file, by its name; -1 if no part has that name."""
+        number = path.stem.removeprefix("part-")
+        return int(number) if number.isdecimal() and path == self.part_path(int(number)) else -1
 
-    def _check_header(self, path: Path, header: PartHeader, index: int) -> None:
-        """Check that a part is of this study and of this chunk. Raises `InputError` or `Damaged`."""
-        if any(header.study.get(name) != self.manifest[name] for name in ("identity", "single_run")):
-            raise InputError(
-                f"{path}: is of another study ('{header.study.get('title') or 'untitled'}', other numbers); move it away, "
-                "and run 'jaxbl sweep' again, which computes this part"
-            )
-        if header.chunk != index or header.layout != self.manifest["layout"]:
-            raise Damaged(f"is part {header.chunk} of this study")
-
-    def _move_to_damaged(self, path: Path, damage: str) -> None:
-        """Move a damaged file to `damaged/`, under a name that is free there."""
-        folder = self.folder / "damaged"
-        names = (path.name if i == 0 else f"{path.name}.{i}" for i in count())
-        target = next(folder / name for name in names if not (folder / name).exists())
-        move_file(path, target)
-        self.damaged.append(f"{path.relative_to(self.folder)} {damage}; it is kept as {target.relative_to(self.folder)}")
+    def list_indices(self) -> list[int]:
+        """Indices of the stored parts. Raises `InputError` if a file among them is not a part of this study."""
+        indices = {path: self._index_of(path) for path in self.list_part_files()}
+        for path, index in indices.items():
+            if not 0 <= index < self.manifest["parts"]:
+                raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
+        return list(indices.values())
 
     def write_part(self, index: int, frame: pd.DataFrame) -> None:
         """Write the rows of a chunk. The store itself does not change, so that this may run in another thread."""
         head = {name: self.manifest[name] for name in ("identity", "single_run", "title")}
         parts.write_part(self.part_path(index), frame, PartHeader(head, self.manifest["layout"], self.backend, index))
 
-    def list_part_files(self) -> list[Path]:
-        """All files among the parts, whole or damaged, in the order of their indices."""
-        # names with six digits come after those with five
-        return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
+    def has_part(self, index: int) -> bool:
+        """True if the part of a chunk is stored and whole. Otherwise as :meth:`read_part`."""
+        return self.read_part(index, ()) is not None
 
-    def read_part(self, index: int, labels: NamedArrays, columns: list[str]) -> pd.DataFrame | None:
-        """Read columns of a chunk; None if the part cannot be read, or has other rows than `labels` (columns by name)."""
+    def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:
+        """Read columns of a chunk; None if its part is not stored. A damaged one is moved to `damaged/`. Raises `InputError`
+        if the part is of another study."""
+        path, folder = self.part_path(index), self.folder / "damaged"
         try:
-            _, frame = parts.read_part(self.part_path(index), [*labels, *columns])
-        except (Damaged, OSError):
+            return self._read(index, path, columns)
+        except FileNotFoundError:
             return None
-        same_rows = all(np.array_equal(frame[name].to_numpy(), column) for name, column in labels.items())
-        return frame if same_rows else None
+        except Damaged as damage:
+            names = (f"{path.name}.{i}" if i else path.name for i in count())
+            target = next(folder / name for name in names if not (folder / name).exists())
+            move_file(path, target)
+            self.damaged.append(f"points/{path.name} {damage}; it is kept as damaged/{target.name}")
+            return None
 
-    def raise_totals(self, parts: int, rows: int) -> None:
-        """Set the numbers of parts and rows of a refined study if they have grown."""
-        if rows > self.manifest["rows"]:
+    def _read(self, index: int, path: Path, columns: Sequence[str] | None, *, check: bool = True) -> pd.DataFrame:
+        """Read columns of a chunk from a file. Raises `InputError` if it is of another study, else as `parts.read_part`."""
+        header, frame = parts.read_part(path, columns, check=check)
+        if header.study.get("identity") != self.manifest["identity"]:
+            title = header.study.get("title") or "untitled"
+            raise InputError(
+                f"{self.part_path(index)}: is of another study ('{title}', other numbers); move it away, and run 'jaxbl "
+                "sweep' again, which computes this part"
+            )
+        if header.chunk != index or header.layout != self.manifest["layout"]:
+            raise Damaged(f"is part {header.chunk} of this study")
+        return frame
+
+    def _read_whole(self, index: int, path: Path, columns: Sequence[str] | None, check: bool) -> pd.DataFrame:
+        """Read as :meth:`_read` does, with an `InputError` for a part that is damaged, too."""
+        try:
+            return self._read(index, path, columns, check=check)
+        except Damaged as damage:
+            raise InputError(
+                f"{self.part_path(index)}: is damaged ({damage}); run 'jaxbl sweep' again, which moves it to damaged/ and "
+                "computes it anew"
+            ) from None
+
+    def set_totals(self, parts: int, rows: int, *, final: bool = False) -> None:
+        """Set the numbers of parts and rows of a refined study that have grown or are final; remove parts beyond these."""
+        if final or rows > self.manifest["rows"]:
             self.update_manifest(parts=parts, rows=rows)
-
-    def restore_part_count(self) -> None:
-        """Raise the number of parts in the manifest to that of the files, its only record if the manifest was lost."""
-        part_count = max(self._split_files()[0], default=-1) + 1
-        if part_count > self.manifest["parts"]:
-            self.update_manifest(parts=part_count)
-
-    def set_final_totals(self, parts: int, rows: int) -> None:
-        """Set the numbers of parts and rows of a refined study that is computed, and remove parts beyond them."""
-        if (self.manifest["parts"], self.manifest["rows"]) != (parts, rows):
-            self.update_manifest(parts=parts, rows=rows)
-        for index, path in self._split_files()[0].items():
-            if index >= parts:
-                path.unlink()
-
-    def _split_files(self) -> tuple[dict[int, Path], list[Path]]:
-        """The files among the parts: those named as parts, by index, and all others."""
-        indexed: dict[int, Path] = {}
-        foreign = []
-        for path in self.list_part_files():
-            number = path.stem.removeprefix("part-")
-            if number.isdecimal() and path == self.part_path(int(number)):
-                indexed[int(number)] = path
-            else:
-                foreign.append(path)
-        return indexed, foreign
-
-    def checked_parts(self) -> dict[int, Path]:
-        """Files of the stored parts by index. Raises `InputError` if a file among them is not a part of this study."""
-        indexed, foreign = self._split_files()
-        for path in [*foreign, *(path for index, path in indexed.items() if index >= self.manifest["parts"])]:
-            raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
-        return indexed
-
-    def _parts_to_read(self) -> dict[int, Path]:
-        """The :meth:`checked_parts`. Raises `InputError` if no part is stored."""
-        indexed = self.checked_parts()
-        if not indexed:
-            raise InputError(f"{self.folder}: holds no points yet; wait for the sweep that runs in it, or run 'jaxbl sweep'")
-        return indexed
+        if final:
+            for path in self.list_part_files():
+                if self._index_of(path) >= parts:
+                    path.unlink()
 
     def columns(self) -> list[str]:
         """Names of the columns."""
@@ -321,43 +281,41 @@ class Store:
     def batches(self, columns: list[str] | None = None) -> Iterator[pd.DataFrame]:
         """Yield the rows of the stored parts, part by part; all columns, or only those named.
 
-        Each file is compared with its checksum when it is read first, and each page whenever it is read.
-
-        Raises:
-            InputError: a part is damaged, or not of this study.
-        """
-        for index, part in self._parts_to_read().items():
-            with _report_damage(part):
-                header, frame = parts.read_part(self._local_copy(part), columns, check=index not in self._checked)
-                self._check_header(part, header, index)
+        Each file is compared with its checksum when it is read first, and each page whenever it is read. Raises
+        `InputError` if a part is damaged, or not of this study."""
+        for index in self._indices_to_read():
+            frame = self._read_whole(index, self._local_copy(index), columns, index not in self._checked)
             self._checked.add(index)
             yield frame
+
+    def _indices_to_read(self) -> list[int]:
+        """The :meth:`list_indices`. Raises `InputError` if no part is stored."""
+        indices = self.list_indices()
+        if not indices:
+            raise InputError(f"{self.folder}: holds no points yet; wait for the sweep that runs in it, or run 'jaxbl sweep'")
+        return indices
 
     def dataset(self, check: bool) -> "Dataset":
         """The rows of the stored parts as a dataset of pyarrow, which compares each page that it reads with its checksum.
 
-        Args:
-            check: first compare each file with its checksum; otherwise only headers are read.
-
-        Raises:
-            InputError: a part is damaged, or not of this study.
-        """
+        With `check`, each file is first compared with its checksum; otherwise only headers are read. Raises as
+        :meth:`batches`."""
         from pyarrow import dataset
 
-        indexed = self._parts_to_read()
-        for index, part in indexed.items():
-            with _report_damage(part):
-                self._check_header(part, parts.read_part(part, (), check=check)[0], index)
+        indices = self._indices_to_read()
+        for index in indices:
+            self._read_whole(index, self.part_path(index), (), check)
         file_format = dataset.ParquetFileFormat(
             default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         )
-        paths: Any = [*indexed.values()]
+        paths: Any = [*map(self.part_path, indices)]
         file_system = paths[0].fs if is_remote(paths[0]) else None
         names = [str(path.path if file_system else path) for path in paths]
         return cast("Dataset", dataset.dataset(names, format=file_format, filesystem=file_system))
 
-    def _local_copy(self, part: Path) -> Path:
+    def _local_copy(self, index: int) -> Path:
         """Path of a part on this machine; a part in an object store is copied here once, since a report reads it often."""
+        part = self.part_path(index)
         if not is_remote(part):
             return part
         if self._copy_folder is None:
@@ -369,13 +327,9 @@ class Store:
         return copy
 
     def verify(self) -> int:
-        """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones.
-
-        Raises:
-            InputError: a part is of another study, or has an index that this study does not have.
-        """
-        whole_parts = sum(map(self.has_part, self._parts_to_read()))
+        """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones. Raises `InputError`
+        if a part is of another study, or has an index that this study does not have."""
+        whole_parts = sum(map(self.has_part, self._indices_to_read()))
         if self.damaged:
-            self.manifest["finished"] = False
-        self.update_manifest()
+            self.update_manifest(finished=False)
         return whole_parts

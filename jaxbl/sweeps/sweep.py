@@ -205,7 +205,7 @@ def sweep(
     with connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
             engine, store = open_or_create_store(folder, engine, overwrite=overwrite)
-            store.checked_parts()
+            store.list_indices()
             if cluster is None:
                 run = StudyRun(engine, store, progress)
                 run.compute_all()

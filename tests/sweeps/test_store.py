@@ -467,11 +467,11 @@ def test_a_dataset_of_damaged_or_foreign_parts_is_refused(study_copy, tmp_path):
 def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
     engine = Engine(read_config(study()), backend="scan")
     results = claim_study(tmp_path, engine.config)
-    store = Store.create(results, engine.config, engine.layout, engine.backend, 100_001, 9)
+    store = Store.create(results, engine)
     rows = next(finished_study[1].source.batches())
     for index in (99_999, 100_000, 2):
         store.write_part(index, rows.assign(seed=index))
-    store.update_manifest()
+    store.update_manifest(parts=100_001)
     stored_study = open_study(tmp_path)
     assert stored_study.frame["seed"].drop_duplicates().tolist() == [2, 99_999, 100_000]
     assert (
