@@ -68,30 +68,28 @@ def inspect(
         from jaxbl.config import read_log_config
 
         table, gear_ratio, nominal = read_log_config(model)
-    guesses: list[str] = []
     if write is None:
         inspection = jaxbl.inspect(log, table, gear_ratio=gear_ratio, nominal=nominal)
+        card = jaxbl.describe(inspection)
     else:
+        import tomli_w
+
         from jaxbl.records.proposal import propose_study
 
         log_keys = None if table is None else table.model_dump(exclude_unset=True)
         study, guesses, inspection = propose_study(log, log_keys, gear_ratio=gear_ratio, nominal=nominal)
-    folder = folder_of(log, "inspected", out)
-    card = jaxbl.describe(inspection)
-    if write is not None:
-        import tomli_w
-
+        # what is to be filled in comes first
+        guesses.sort(key=lambda guess: "put in" not in guess)
         remarks = [
             f"Proposed by jaxbl inspect --write from {log.name}. Look it through: names, units, and the drive.",
             *guesses,
         ]
         write_atomic(write, "".join(f"# {escape_unprintable(remark)}\n" for remark in remarks) + tomli_w.dumps(study))
-        open_guesses = [guess for guess in guesses if "put in" in guess or "can name" in guess or "placeholder" in guess]
-        lead = f"{write}: a first model{'; fill in first: ' if open_guesses else '.'}{' '.join(open_guesses)}"
-        remarks = [lead, *(guess for guess in guesses if guess not in open_guesses), *card.remarks]
+        card = jaxbl.describe(inspection)
         # without an input there is nothing to be fitted yet
         steps = [] if "u" in study["log"].get("absent", ()) else after_proposal(log, write)
-        card = replace(card, remarks=remarks, next_steps=steps)
+        card = replace(card, remarks=[f"{write}: a first model.", *guesses, *card.remarks], next_steps=steps)
+    folder = folder_of(log, "inspected", out)
     with open_results(folder, log_subject(log), overwrite=overwrite) as results:
         # the terminal has no line left for it
         jaxbl.write_report(inspection, results, replace(card, next_steps=card.next_steps or after_inspection(log, model)))

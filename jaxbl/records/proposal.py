@@ -154,9 +154,7 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
     if "u" not in table:
         table["absent"] = ["u"]
-        spare = [str(column) for column in file.columns if column not in [candidate.column for candidate in chosen.values()]]
-        choice = f"; [log] u can name one of: {', '.join(spare)}" if spare else ""
-        guesses.append(f"No column looks like a torque: u is taken as not recorded{choice}.")
+        guesses.append("No column looks like a torque: put in [log] u, or it is taken as not recorded.")
     if "t" not in table:
         raise InputError(f"{path}: no column is called like a time; [log] t can name it, or give a period")
     return table, guesses

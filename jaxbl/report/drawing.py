@@ -304,17 +304,18 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
         room = 2.5 * len(line.name) * ax.figure.dpi / 72.0
         half = int(np.clip(room / max(np.hypot(*(path[1] - path[0])), 1e-9), 1, (len(path) - 1) // 2))
         first, middle, last = path[: -2 * half], path[half:-half], path[2 * half :]
-        (left, low), (right, high), along = ax.bbox.min, ax.bbox.max - [0.0, 2.0 * _NAME_SIZE], last - first
-        fit = (middle > [left + room, low]).all(axis=1) & (middle < [right - room, high]).all(axis=1)
-        fit &= np.abs(along[:, 1]) < np.abs(along[:, 0])
-        others = np.concatenate([np.full((1, 2), np.inf), *(other for other in paths if other is not path)])
-        apart = np.hypot(*(middle[:, None] - others).transpose(2, 0, 1)).min(axis=1).clip(max=10.0 * _NAME_SIZE)
-        bent = np.hypot(*(middle - 0.5 * (first + last)).T)
+        across, up = np.abs(last - first).T
+        (low, high), margin = np.asarray(ax.bbox), np.array([room, 2.0 * _NAME_SIZE])
+        fit = ((middle > low + margin) & (middle < high - margin)).all(axis=1) & (up < across)
+        beside = np.concatenate([np.full((1, 2), np.inf), *(neighbour for neighbour in paths if neighbour is not path)])
+        apart = np.hypot(*(middle[:, None] - beside).transpose(2, 0, 1)).min(axis=1).clip(max=10.0 * _NAME_SIZE)
+        worth = np.where(fit, apart - 4.0 * np.hypot(*(middle - 0.5 * (first + last)).T), -np.inf)
         if fit.any():
-            i = int(np.argmax(np.where(fit, apart - 4.0 * bent, -np.inf)))
-            turn = float(np.arctan2(along[i, 1], along[i, 0]))
+            i = int(np.argmax(worth))
+            turn = float(np.arctan2(*(last - first)[i, ::-1]))
             name = ax.annotate(
-                _plain(line.name), ax.transData.inverted().transform(middle[i]), (-3.0 * np.sin(turn), 3.0 * np.cos(turn)),
+                _plain(line.name), tuple(ax.transData.inverted().transform(middle[i])),
+                (-3.0 * np.sin(turn), 3.0 * np.cos(turn)),
                 textcoords="offset points", fontsize=_NAME_SIZE, ha="center", va="bottom", zorder=6, color=_NAME,
                 rotation=np.degrees(turn), rotation_mode="anchor",
             )  # fmt: skip
@@ -323,10 +324,9 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
 
 def _follow(ax: Axes, line: Line) -> np.ndarray:
     """Places along a line in pixels, evenly, shape (places, 2); what is far outside of the axes is nearer."""
-    far = np.array([100.0, 100.0])
     with np.errstate(all="ignore"):
         path = ax.transData.transform(np.column_stack([line.x, line.y]))
-    path = np.clip(np.nan_to_num(path), ax.bbox.min - far, ax.bbox.max + far)
+    path = np.clip(np.nan_to_num(path), *ax.bbox.padded(100.0).get_points())
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
     return np.stack([np.interp(np.linspace(0.0, way[-1], 301), way, places) for places in path.T], axis=1)
 

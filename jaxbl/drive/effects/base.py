@@ -294,8 +294,11 @@ class AbstractEffect(eqx.Module):
     @classmethod
     def possible(cls, numbers: Mapping[str, float]) -> bool:
         """True if fitted numbers may be those of such an effect: each size is above its minimum."""
-        minima = {field.name: declaration.minimum for field, declaration in parameters(cls) if field.name in cls.sizes()}
-        return all(minimum is None or numbers[name] > minimum for name, minimum in minima.items())
+        return all(
+            declaration.minimum is None or numbers[field.name] > declaration.minimum
+            for field, declaration in parameters(cls)
+            if field.name in cls.sizes()
+        )
 
     @classmethod
     def find_fault(cls, numbers: Mapping[str, Any], period: float) -> str:
