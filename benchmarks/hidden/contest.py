@@ -8,10 +8,12 @@ person has them (even times, one zero): they do not depend on what a tree makes 
 import csv
 import hashlib
 import json
+import math
 import os
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from .named import findings_of_terms, score, tables
+from .named import TRUTH, findings_of_terms, score, tables
 from .workshop import make_cases
 
 ROOT = Path(__file__).parents[2]
@@ -136,6 +138,7 @@ def left_by(folder: Path, models: dict[str, Any]) -> dict[str, float | None]:
     from real.derivatives import torque_error
 
     from jaxbl.config import read_model
+    from jaxbl.drive.effects import EFFECTS
 
     truth = _read(folder / "truth.json")
     errors: dict[str, float | None] = {}
@@ -144,11 +147,41 @@ def left_by(folder: Path, models: dict[str, Any]) -> dict[str, float | None]:
         record: Any = SimpleNamespace(sample_period=truth["period"])
         for name, model in models.items():
             try:
-                errors[name] = float(np.sqrt(np.mean(torque_error(read_model(model)[0], record, held) ** 2)))
+                study = read_model(model)[0]
+                # the motion is read as the encoders are meant: an offset of theirs is no torque
+                torques = [effect for effect in study.effects if not EFFECTS[effect.kind].in_log]
+                study = study.model_copy(update={"effects": torques})
+                errors[name] = float(np.sqrt(np.mean(torque_error(study, record, held) ** 2)))
             except Exception as error:
                 print(f"{folder.name}: {name} leaves no torque: {error}", file=sys.stderr)
                 errors[name] = None
     return errors
+
+
+def write_true_study(folder: Path) -> dict[str, Any] | None:
+    """The study of a case's machine as it is, with the laws of the package that are nearest to the bench's; None of a geared
+    one and of friction under load, which have none. What it leaves is what no model can do without."""
+    truth, study = _read(folder / "truth.json"), tomllib.loads((folder / "model.toml").read_text())
+    axis = truth["axis"]
+    if axis["stiffness"] > 0.0 or axis["under_load"] > 0.0:
+        return None
+    study["drive"] |= {path.partition(".")[2]: value for path, value in truth["true_numbers"].items()}
+    sizes = axis["amplitude"], axis["amplitude"] * axis["double"]
+    waves = {
+        f"{part}{end}": size * of(number * axis["phase"])
+        for number, (size, end) in enumerate(zip(sizes, ("", "_2"), strict=True), 1)
+        for part, of in (("sine", math.cos), ("cosine", math.sin))
+    }
+    friction = {"torque": axis["friction"], "length": axis["length"], "breakaway_ratio": axis["rise"]}
+    effects = {
+        "motor.presliding_friction": friction | {"stribeck_velocity": axis["fall"]},
+        "motor.cogging_harmonics": {"harmonic": axis["waves"]} | waves,
+        "motor.constant_torque": {"torque": axis["offset"]},
+        "load.gravity": {"torque": axis["gravity"], "phase": axis["hangs"]},
+    }
+    there = axis["friction"], axis["amplitude"], axis["offset"], axis["gravity"]
+    acting = [{"kind": kind} | numbers for size, (kind, numbers) in zip(there, effects.items(), strict=True) if size]
+    return study | {"effects": acting}
 
 
 def ask_rivals(folder: Path) -> dict[str, Any]:
@@ -218,6 +251,8 @@ def hold_contest(
         path = out / "left" / f"{folder.name}.json"
         torques = _read(path) if path.exists() else {}
         models = {label: model for label in labels if (model := tools[label][folder.name].get("model"))}
+        if rivals and (study := write_true_study(folder)) is not None:
+            models[TRUTH] = study
         models = {name: model for name, model in {"nominal": folder / "model.toml", **models}.items() if name not in torques}
         if models:
             torques |= left_by(folder, models)

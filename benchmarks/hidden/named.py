@@ -33,6 +33,8 @@ NAMES: dict[str, tuple[str, ...]] = {
     "eccentricity": ("transmission.eccentricity",),
 }
 """Effect of the truth -> names that are right on any machine; :func:`admissible_names` adds those of some."""
+TRUTH = "the machine itself"
+"""What has the true numbers and laws, beside the tools."""
 SURE = 0.95
 """Confidence above which a wrong name is surely wrong."""
 _SEEN = 2.0
@@ -221,6 +223,7 @@ def tables(
     lines += [_tool_row(tool, truths, answers, left, rivals) for tool, answers in tools.items()]
     # the others name nothing
     nameless = [tool for tool in rivals if tool not in tools]
+    nameless += [TRUTH] if any(TRUTH in torques for torques in left.values()) else []
     lines += [f"| {tool} |{' - |' * 7} {_left_text(tool, names, left, rivals)} | - |" for tool in nameless]
     scores = {
         tool: {name: score(truths[name], answer) for name, answer in answers.items()} for tool, answers in tools.items()
