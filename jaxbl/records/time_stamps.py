@@ -272,6 +272,10 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         )
     intervals_within = intervals[intervals <= stamps.max_interval]
     period = stamps.median_interval
+    lost = np.round(intervals_within / period) - 1.0
+    if lost.any() and np.allclose(intervals_within, (lost + 1.0) * period, rtol=0.0, atol=0.1 * period):
+        row = rows[int(np.argmax((intervals > 1.5 * period) & (intervals <= stamps.max_interval)))] + 1
+        file.notes.append(f"{int(lost.sum())} rows are missing, after data row {row} first; they are interpolated.")
     if is_even:
         times = times.copy()
         for piece, fit in zip(segments, fits, strict=True):

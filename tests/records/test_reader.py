@@ -194,6 +194,14 @@ def test_resampled_positions_are_accurate_to_the_fourth_order(tmp_path_factory, 
     assert errors[1] < max(errors[0] / 8.0, 1e-9)
 
 
+def test_rows_that_are_missing_are_counted(tmp_path):
+    frame = simulate_log()
+    record = read_record(write_frame(tmp_path, frame.drop(index=[100, 200, 201])), gear_ratio=GEAR_RATIO)
+    assert "3 rows are missing, after data row 100 first; they are interpolated." in record.notes
+    jittered = frame.assign(t=frame["t"] + 2e-4 * np.sin(np.arange(len(frame))))
+    assert not any("missing" in note for note in read_record(write_frame(tmp_path, jittered), gear_ratio=GEAR_RATIO).notes)
+
+
 def test_repeated_stamps_are_left_out_and_gaps_part_the_log(tmp_path):
     frame = simulate_log(uneven_times())
     kept_rows = frame.drop(index=[*range(1000, 1200), *range(2500, 2510)])
