@@ -967,8 +967,8 @@ def test_a_log_is_diagnosed_once(axis_log, quick_tasks, call, tmp_path):
     assert lines[0].startswith("✓ Good: The model lacks motor.coulomb_friction; with it, it predicts new data as well as")
     assert lines[2].strip().startswith("next experiment  Nothing is tied") and not (tmp_path / "next.csv").exists()
     figures = [
-        "         1 → 0.01 N m  motor: missing torque: rms error on held-out data (noise 0.01)",
-        "      0.1 → 0.001 rad  motor position: rms error on held-out data (noise 0.001)",
+        "         1 → 0.01 N m  motor: missing torque: rms error on held-out data (limit 0.02)",
+        "      0.1 → 0.001 rad  motor position: rms error on held-out data (limit 0.0012)",
         "  0.0500 ± 0.0010 N m  motor.coulomb_friction: torque",
     ]
     assert lines[4:6] == figures[:2]

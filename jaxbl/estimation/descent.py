@@ -39,8 +39,9 @@ def descend(
         if not np.isfinite(best.deviance):
             return best, False
         matrix, towards = linearise(best)
+        size = np.diag(matrix) ** -0.5
         for _ in range(_MOST_REJECTED):
-            following = move(best, -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), towards))
+            following = move(best, -np.linalg.solve(matrix + damping * np.diag(size**-2.0), towards))
             gained = best.deviance - following.deviance
             if gained > 0.0:
                 best, damping = following, max(0.1 * damping, _LEAST)

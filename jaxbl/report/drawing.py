@@ -249,7 +249,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
         _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
-    _name_lines(ax, [part for part in panel.parts if isinstance(part, Line) and part.at_line])
+    _name_lines(ax, [part for part in panel.parts if isinstance(part, Line) and part.at_line and len(part.x) > 1])
     ax.grid(not any(isinstance(part, Map) for part in panel.parts))
     for name, axis in panel.axes.items():
         drawn = getattr(ax, f"{name}axis")
