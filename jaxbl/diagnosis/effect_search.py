@@ -562,9 +562,10 @@ class EffectSearch:
                 scale[list(columns.places[i])] *= size
                 sized = dataclasses.replace(columns, scale=scale)
                 none, with_function = evidence_of(sized), evidence_of(sized, functions, i)
-                assert none is not None and with_function is not None
-                nats = self._nats(linear, none, with_function)
-                best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
+                # columns that are all but alike may have no solution
+                if none is not None and with_function is not None:
+                    nats = self._nats(linear, none, with_function)
+                    best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
             gained[function.name] = best
         return gained
 

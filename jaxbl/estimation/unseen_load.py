@@ -512,6 +512,8 @@ class GapSearch:
         # the load in the middle of the gap
         middle = begun._replace(start=np.zeros_like(without.start))
         point = self.model_held.finish(self.coarse_held.resume(middle, _MORE, _FOLLOWING[-1]))
+        # compared with the same predictor, too
+        point = _likeliest([point, self.model_held.resume(point, _MORE, without.smoothness)])
         # on one flank, where a weight may hold the load, the load is met
         half = self.model.half_gap(point.theta)
         met = any(np.any(np.abs(twist) >= half) for twist in self._twists(point))
