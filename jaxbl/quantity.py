@@ -61,7 +61,8 @@ class Quantity:
         return self.value / self.nominal if self.nominal else math.nan
 
     def __str__(self) -> str:
-        """Return value, standard error and unit: of the error the first digit, or two if that is a 1."""
+        """Return value, standard error and unit: of the error the first digit, or two if that is a 1; no error where the
+        ends of the interval are not known."""
         # of a fit that is rejected a standard error says nothing
         unknown = bool(self.interval) and all(map(math.isnan, self.interval or ()))
         texts = [f"{self.value:.{3 if unknown else 5}g}"]

@@ -1,9 +1,10 @@
 """Where a model lacks torque: over time, speed, position, reversals, gap, load and frequency, each with its significance.
 
 Two questions are asked of each region. How much of the residual's power beyond the noise lies there: judged against the
-noise alone, with its deviation and correlation. And is the mean torque there other than zero: judged against the scatter
-of the means of blocks of time, if that is larger, so that a slow disturbance that the noise level does not know of is no
-finding. How much of the power a function of one coordinate explains is counted on blocks of time that it was not made from.
+noise alone, and as many independent samples as its spectrum leaves. And is the mean torque there other than zero: judged
+against the scatter of the means of blocks of time, so that a slow disturbance that the noise level does not know of is no
+finding; over time, where each moment comes but once, against the noise. How much of the power a function of one
+coordinate explains is counted on blocks of time that it was not made from.
 """
 
 import itertools

@@ -512,7 +512,7 @@ class GapSearch:
         # the load in the middle of the gap
         middle = begun._replace(start=np.zeros_like(without.start))
         point = self.model_held.finish(self.coarse_held.resume(middle, _MORE, _FOLLOWING[-1]))
-        # compared with the same predictor, too
+        # a fit may end with another predictor than the one without a gap did: the same one is tried, too
         point = _likeliest([point, self.model_held.resume(point, _MORE, without.smoothness)])
         # on one flank, where a weight may hold the load, the load is met
         half = self.model.half_gap(point.theta)

@@ -311,7 +311,8 @@ def _inspect_or_mend(path: str | Path, table: _Table, guesses: list[str] | None)
         if key in table.get(channel, {key}) and not assumed:
             raise
     table[channel][key] = tomllib.loads(f"value = {value}")["value"]
-    guesses[:] = [guess for guess in guesses if guess != assumed]
+    if assumed:
+        guesses.remove(assumed)
     guesses.append(f"{channel}.{key} = {value}: {reason}.")
     return None
 

@@ -76,10 +76,9 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
         if there := [name for name in channels if name in errors]:
             name = max(there, key=lambda name: _ratio(errors[name][0], errors[name][2]))
-            before, after, noise, limit = errors[name]
+            before, after, _, limit = errors[name]
             change = f"{rms_text(before)} → {rms_text(after)} {gap['units'][name]}"
-            least = f"noise {rms_text(noise)}" if limit is None else f"limit {rms_text(limit)}"
-            figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data ({least})"))
+            figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (limit {rms_text(limit)})"))
     if summary["findings"]:
         finding = min(summary["findings"], key=lambda finding: finding["confidence"])
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))

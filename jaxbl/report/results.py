@@ -54,9 +54,13 @@ def _log(result: Any) -> Subject:
     return log_subject(Path(result.summary["file"]))
 
 
-_KINDS: dict[type, _Kind] = {
-    # the result that `draw` of a module takes
-    next(iter(kind.report.draw.__annotations__.values())): kind
+def _find_result_type(report: Any) -> type:
+    """Find the type of the results that a module reports on: of the argument of its `draw`."""
+    return next(iter(report.draw.__annotations__.values()))
+
+
+_KINDS = {
+    _find_result_type(kind.report): kind
     for kind in (
         _Kind(simulate, "summary.json"),
         _Kind(sweep),

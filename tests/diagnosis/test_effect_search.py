@@ -1,6 +1,7 @@
 """Effects hidden by the bench's own simulator are named; nothing is named where nothing or something unknown is hidden."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from hidden.cases import cases
 from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
+from jaxbl.diagnosis import effect_search
 from jaxbl.diagnosis.confidence import weigh
 from jaxbl.diagnosis.effect_search import EffectSearch
+from jaxbl.diagnosis.evidence import Products
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.thresholds import LIMITS
 from jaxbl.drive.effects import DELAY_SAMPLES
@@ -142,3 +145,14 @@ def test_numbers_that_are_all_off_are_no_effect(tmp_path):
     explanation = search.run()
     assert explanation.fitted.names == () and search.fits is search.rough
     assert explanation.largest_gain < LIMITS.unknown
+
+
+def test_a_free_function_without_a_solution_shows_nothing(monkeypatch):
+    # no products of real columns: rounding made these of a function that is all but a number of the model
+    alike = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1e9], [0.0, 1e9, 1.0]])
+    columns = Products(alike, 1, ((2,),), (-1,), np.ones(3), np.zeros(3))
+    predictor = SimpleNamespace(smoothness=[1.0], deviation=np.ones(1))
+    linear = SimpleNamespace(choose=lambda _: predictor, columns=lambda *_: columns, signals=[])
+    monkeypatch.setattr(effect_search, "functions_of", lambda _: [SimpleNamespace(name="motor.time")])
+    search = SimpleNamespace(floor=0.0)
+    assert EffectSearch.remainder(search, SimpleNamespace(linear=linear)) == {"motor.time": (-np.inf, 0.0)}  # type: ignore

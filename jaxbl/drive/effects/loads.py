@@ -16,10 +16,10 @@ unequal gains of two sensors, 6 from commutation or windings that are not sinuso
 TRIAL_ARC = 3.0 * np.pi
 """Part of a wave that the motion must cover for its harmonic to be tried, rad: over less it does not repeat."""
 MAX_DAMPING_RATIO = 0.95
-"""Damping ratio above which an inertia behind a spring hardly swings, so that its frequency has no meaning."""
+"""Largest damping ratio that is simulated: the exact step is that of a swing, and from 1 on nothing swings."""
 _LARGEST_DAMPING = 0.5
-"""Damping ratio below which a flexible part is named: rubber couplings reach 0.16 (relative damping 2, DIN 740-2), and from
-0.7 on nothing swings. What a fit takes to more is another loss: friction that bends, or slip."""
+"""Damping ratio up to which a diagnosis names a flexible part: rubber couplings reach 0.16 (relative damping 2, DIN 740-2),
+and from 0.7 on there is no resonance. Where a fit ends above, another loss makes it: friction that bends, or slip."""
 
 
 def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
