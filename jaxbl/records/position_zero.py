@@ -21,12 +21,12 @@ _CUTOFF = 50.0
 """Cutoff of the low-pass for accelerations, Hz: above it their noise is larger than the torques of most drives."""
 _MIN_ROWS = 10 * BLOCKS
 """Rows of a log in motion at least: some ten in each block."""
-_SURE_WAVE_ERRORS = 6.0
-"""Standard errors from which on a wave is sure: one of eighty numbers exceeds them by chance in 1 log of 100."""
+_SURE_ERRORS = 6.0
+"""Standard errors from which on a wave is sure, one of eighty numbers exceeds them by chance in 1 log of 100, and a shift."""
 _MOST_WAVES = 8
 """Waves that are sought: the largest of them are enough to tell a shift."""
 _SURE_SHIFT_ERRORS, _BETTER_ERRORS = 4.0, 3.0
-"""Standard errors by which shifted waves have to be better than no waves, among a hundred shifts, and than unshifted."""
+"""Standard errors by which shifted waves have to be better than no waves, among a hundred shifts, and than another shift."""
 _SHIFTS_PER_PERIOD = 8
 """Shifts that are compared in each period of the fastest wave."""
 
@@ -117,11 +117,8 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     squares_without_waves = np.array([np.sum(residuals[block, 0] ** 2) for block in blocks])
     squares = np.array([np.sum((residuals[block, :1] - residuals[block, 1:]) ** 2, axis=0) for block in blocks])
     total = squares.sum(axis=0)
-    best, squares_unshifted = int(np.argmin(total)), squares[:, len(shifts) // 2]
-    if not (
-        _error_reduction(squares_without_waves, squares[:, best]) > _SURE_SHIFT_ERRORS
-        and _error_reduction(squares_unshifted, squares[:, best]) > _BETTER_ERRORS
-    ):
+    best = int(np.argmin(total))
+    if not _error_reduction(squares_without_waves, squares[:, best]) > _SURE_SHIFT_ERRORS:
         return None
     lowest = np.flatnonzero((total <= np.roll(total, 1)) & (total <= np.roll(total, -1)))
     equal_shifts = [i for i in lowest if i == best or _error_reduction(squares[:, i], squares[:, best]) < _BETTER_ERRORS]
@@ -134,7 +131,7 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
         for sums in (total, *(total - block_squares for block_squares in squares))
     )
     error = float(np.sqrt(jackknife_variance(without)))
-    if not abs(value) > _BETTER_ERRORS * error:
+    if not abs(value) > _SURE_ERRORS * error:
         return None
     return ZeroShift(float(value), error, tuple(sorted(harmonics.tolist())))
 
@@ -157,7 +154,7 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
         wave = lowest + int(np.argmax([np.sum((pair.T @ torque) ** 2) for pair in pairs]))
         columns = np.column_stack([columns, rows.cosine[:, wave], rows.sine[:, wave]])
         coefficients, errors = fit_with_jackknife(rows.torque, columns)
-        if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_WAVE_ERRORS:
+        if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_ERRORS:
             break
         waves, values = [*waves, wave], coefficients
     return waves, values

@@ -33,6 +33,12 @@ def test_the_difference_of_the_zeros_is_found(gear: bool):
     assert abs(shift.value - 0.4) < 4.0 * shift.error < 0.04
 
 
+def test_a_small_part_of_a_period_is_found():
+    # 4 % of a period of the faster wave, a third of the steps in which shifts are compared
+    shift = find_zero_shift(simulate_turning_log(1, 0.0), simulate_turning_log(2, 0.025))
+    assert shift is not None and abs(shift.value - 0.025) < 4.0 * shift.error < 0.02
+
+
 def test_the_first_fifth_of_a_log_is_enough_to_turn_it():
     short = simulate_turning_log(2, 0.4)._replace(segments=[slice(0, 1600)])
     shift = find_zero_shift(simulate_turning_log(1, 0.0), short)
