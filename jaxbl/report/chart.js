@@ -14,6 +14,13 @@ const endsOf = (columns, log = false) => {
   return [low, high];
 };
 
+/** The same with some length: of no number, or of one. */
+const widened = ([low, high], log = false) => {
+  if (!(low <= high)) return log ? [1, 10] : [0, 1];
+  const more = 0.5 * Math.abs(low) || 0.5;
+  return low < high ? [low, high] : log ? [low / 2, 2 * high] : [low - more, high + more];
+};
+
 /** Round values between two ends; on a logarithmic axis decades, of few decades 2 and 5 as well. */
 const ticks = (low, high, log, most = 6) => {
   const decades = log ? Math.log10(high / low) : 0, every = Math.ceil(decades / most), factors = decades < 2.5 ? [1, 2, 5] : [1];
@@ -53,16 +60,17 @@ const dotsOf = (chart, line) => (plot) => {
 /**
  * `x` and `y` are { label, name, key, unit, names, log, ends, hidden }: the label stands along the axis, the name beside a value; names stand
  * for the numbers 0, 1, ..., or as a Map for others; ends leave out what lies beyond, and may fall.
- * A line is { name, x, y, colour, alpha, dash, width, dots, shade, sorted, said }; `named` says the lines' names above.
+ * A line is { name, x, y, colour, alpha, dash, width, dots, shade, sorted, said }, and `shades` behind lines are { along, low, high },
+ * or { x, low, high } as columns, with { name, colour, alpha }; `named` says the names of both above.
  * Cells, behind the lines, are { x, y, size, colours, text }: ends along both axes, numbers of cells, the canvas of one pixel a
  * cell, and what is said of the cell [i, j], null of none. `scale` has the colours of dots with a shade.
  * `marks`, [x, y, kind] each, are drawn last: "ring", "ghost" or "star". Charts of a `group` over the same quantity are enlarged
  * together; `zoomed` hears the ends in place of that, null of the whole. `picked` hears what is clicked: { line, i } or { cell }.
  */
 class Chart {
-  constructor(element, { height = 240, caption = "", title = "", ...given }) {
+  constructor(element, { height = 240, caption = "", title = "", lines = [], ...given }) {
     for (const axis of [given.x, given.y]) if (Array.isArray(axis.names)) axis.names = new Map(axis.names.entries());
-    Object.assign(this, { element, height, lines: [], shades: [], range: null, cells: null, scale: null, marks: [], group: [], ...given });
+    Object.assign(this, { height, lines: lines.filter((one) => one.x.length), shades: [], range: null, cells: null, scale: null, marks: [], group: [], ...given });
     for (const axis of [this.x, this.y]) axis.name ??= axis.label;
     this.group.push(this);
     this.box = made("div", { className: "values", hidden: true, ariaLive: "polite" });
@@ -70,19 +78,17 @@ class Chart {
     this.view.setAttribute("role", "application");
     // uPlot sizes itself later
     this.view.style.height = `${this.height}px`;
-    this.key = made("p", { className: "legend" });
-    element.replaceChildren(...(title ? [made("p", { className: "over", textContent: title })] : []), this.key, this.view, ...(caption ? [made("figcaption", { textContent: caption })] : []));
+    const over = title ? [made("p", { className: "over", textContent: title })] : [], below = caption ? [made("figcaption", { textContent: caption })] : [];
+    element.replaceChildren(...over, this.legend(), this.view, ...below);
     this.listen();
+    this.build();
     new ResizeObserver(() => { if (this.plot?.width !== this.view.clientWidth) this.build(); }).observe(this.view);
   }
-  /** Lines, and what is shaded behind them: { along, low, high } or { x, low, high } as columns, with { name, colour, alpha }. */
-  set(lines, shades = []) {
-    this.lines = lines.filter((one) => one.x.length);
-    this.shades = shades;
-    const named = [...this.lines, ...shades.map((one) => ({ colour: GREY, ...one }))].filter((one) => this.named && one.name);
+  /** Names of lines and of what is shaded, each once. */
+  legend() {
+    const named = [...this.lines, ...this.shades.map((one) => ({ colour: GREY, ...one }))].filter((one) => this.named && one.name);
     const entries = new Map(named.map(({ name, colour, dash }) => [name, made("span", {}, markOf(colour ?? "currentColor", dash?.length), name)]));
-    this.key.replaceChildren(...entries.values());
-    this.build();
+    return made("p", { className: "legend" }, ...entries.values());
   }
   /** Ends of both axes of what is shown. */
   ends() {
@@ -91,11 +97,9 @@ class Chart {
       if (this.range?.[i]) return this.range[i];
       if (axis.ends) return axis.ends;
       const shaded = this.shades.filter((one) => one.x).flatMap((one) => (i ? [one.low, one.high] : [one.x]));
-      let [low, high] = endsOf([...this.lines.map((one) => one[name]), ...shaded], axis.log);
-      if (!(low <= high)) [low, high] = axis.log ? [1, 10] : [0, 1];
-      if (low === high) { const more = Math.abs(low) || 1; [low, high] = axis.log ? [low / 2, 2 * high] : [low - 0.5 * more, high + 0.5 * more]; }
-      const room = axis.names ? 0.5 : i || this.lines.some((one) => one.dots) ? 0.04 * (axis.log ? Math.log(high / low) : high - low) : 0;
-      return axis.log ? [low * Math.exp(-room), high * Math.exp(room)] : [low - room, high + room];
+      const ends = widened(endsOf([...this.lines.map((one) => one[name]), ...shaded], axis.log), axis.log), { value } = along({ ends, log: axis.log });
+      const room = axis.names ? 0.5 / (ends[1] - ends[0]) : i || this.lines.some((one) => one.dots) ? 0.04 : 0;
+      return [value(-room), value(1 + room)];
     });
   }
   axis(name, i, ends) {
@@ -129,8 +133,8 @@ class Chart {
     const said = this.scale ? `colours: ${withUnit(this.scale.label, this.scale.unit)}, ${this.scale.said}` : this.lines.map((one) => one.name).filter(Boolean).join(", ");
     this.view.setAttribute("aria-label", `${withUnit(this.y.label ?? "", this.y.unit)} over ${withUnit(this.x.label ?? "", this.x.unit)}, from ${text(ends[1][0])} to ${text(ends[1][1])}: ${said}; arrow keys read values, 0 shows the whole`);
   }
-  /** Draws again, as other points are marked. */
-  draw() { this.plot?.redraw(false); }
+  /** Marks other points. */
+  mark(marks) { this.marks = marks; this.plot?.redraw(false); }
   /** The place of a point in the view, or in the canvas, in pixels. */
   at(x, y, canvas = false) { return [this.plot.valToPos(x, "x", canvas), this.plot.valToPos(y, "y", canvas)]; }
   clip({ ctx, bbox }) { ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip(); }
@@ -144,7 +148,7 @@ class Chart {
       ctx.drawImage(this.cells.colours, left, top, right - left, bottom - top);
       if (this.cells.hatched) {
         // strokes where the mask is
-        const strokes = Object.assign(document.createElement("canvas"), { width: ctx.canvas.width, height: ctx.canvas.height }), own = strokes.getContext("2d"), high = bbox.height;
+        const strokes = made("canvas", { width: ctx.canvas.width, height: ctx.canvas.height }), own = strokes.getContext("2d"), high = bbox.height;
         Object.assign(own, { imageSmoothingEnabled: false, strokeStyle: "#ffffffb0", lineWidth: devicePixelRatio });
         own.beginPath();
         for (let k = -high; k < bbox.width; k += 9 * devicePixelRatio) { own.moveTo(bbox.left + k, bbox.top + high); own.lineTo(bbox.left + k + high, bbox.top); }
@@ -199,21 +203,17 @@ class Chart {
     this.range = range;
     this.show(null);
     if (this.zoomed) return this.zoomed(range);
-    for (const one of new Set([this, ...this.group])) {
-      if (one !== this && (!this.x.name || one.x.name !== this.x.name || one.x.log !== this.x.log)) continue;
+    const { name, log } = this.x;
+    for (const one of this.group.filter((other) => other === this || (name && other.x.name === name && other.x.log === log))) {
       if (one !== this) one.range = range && [range[0], null];
       one.build();
     }
   }
   /** What lies at a place in pixels of the plotting area: a cell, or the nearest sample, none farther than 40 pixels. */
   nearest([left, top]) {
-    if (!this.plot) return null;
     const value = [this.plot.posToVal(left, "x"), this.plot.posToVal(top, "y")];
     if (this.cells) {
-      const cell = value.map((one, i) => {
-        const [low, high] = this.cells["xy"[i]], map = this["xy"[i]].log ? Math.log : (number) => number;
-        return Math.floor((this.cells.size[i] * (map(one) - map(low))) / (map(high) - map(low)));
-      });
+      const cell = ["x", "y"].map((name, i) => Math.floor(this.cells.size[i] * along({ ends: this.cells[name], log: this[name].log }).share(value[i])));
       return cell.every((one, i) => one >= 0 && one < this.cells.size[i]) && this.cells.text(cell) ? { cell, place: value } : null;
     }
     return nearestOf(this.lines, [left, top], 40, (x, y) => this.at(x, y), [-40, 40].map((more) => this.plot.posToVal(left + more, "x")));
@@ -239,14 +239,14 @@ class Chart {
     view.addEventListener("pointerleave", () => this.show(null));
     view.addEventListener("blur", () => { chosen = null; this.show(null); });
     view.addEventListener("keydown", (event) => {
-      const [step, turn] = STEPS[event.key] ?? [0, 0], count = this.lines.length;
+      const [step, turn] = STEPS[event.key] ?? [0, 0], { lines } = this;
       if (event.key === "0" || event.key === "Escape") this.zoom(null);
       else if ((step || turn) && this.cells?.move) this.cells.move(step, -turn);
-      else if ((step || turn) && count) {
-        const line = chosen ? (chosen.line + turn + count) % count : 0, { length } = this.lines[line].x;
-        chosen = { line, i: Math.min(length - 1, Math.max(0, (chosen?.i ?? 0) + (chosen ? step : 0) * Math.max(1, Math.floor(length / 100)))) };
-        this.show({ line: this.lines[line], i: chosen.i });
-      } else if (event.key === "Enter" && this.picked) { const found = this.cells ? {} : chosen && { line: this.lines[chosen.line], i: chosen.i }; if (found) this.picked(found); }
+      else if ((step || turn) && lines.length) {
+        const line = chosen ? lines.at((lines.indexOf(chosen.line) + turn) % lines.length) : lines[0], { length } = line.x;
+        chosen = { line, i: chosen ? clamped(chosen.i + step * Math.max(1, Math.floor(length / 100)), 0, length - 1) : 0 };
+        this.show(chosen);
+      } else if (event.key === "Enter" && (this.cells || chosen)) this.picked?.(chosen ?? {});
       else return;
       event.preventDefault();
     });

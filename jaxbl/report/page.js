@@ -2,16 +2,8 @@
 /* Draws lines by uPlot in place of their picture, reads values off other figures, zooms them, and sorts tables. Without it, the
  * page is whole. */
 
-/** Shares of an axis's length as values, and back. */
-const along = ({ ends, log }) => {
-  const [map, back] = log ? [Math.log, Math.exp] : [Number, Number], [low, high] = ends.map(map);
-  return { share: (value) => (map(value) - low) / (high - low), value: (share) => back(low + share * (high - low)) };
-};
 /** The cell of a value between edges that rise or fall; -1 outside. */
-const cellOf = (edges, value) => {
-  const falls = edges[0] > edges[edges.length - 1], rising = falls ? edges.toReversed() : edges, last = edges.length - 2, k = Math.min(before(rising, value), last);
-  return value < rising[0] || value > rising[last + 1] ? -1 : falls ? last - k : k;
-};
+const cellOf = (edges, value) => edges.findIndex((edge, k) => (value - edge) * (value - edges[k + 1]) <= 0);
 
 /** What a panel has at a place, in pixels from its corner: lines of text, and of a point where it is. */
 const found = (panel, at, size) => {
@@ -45,10 +37,9 @@ const charts = [];
 const charted = (element, { x, y, title, lines, shades }, height) => {
   // a label that is longer than its axis stands above it
   const above = 6.4 * y.label.length > height - 38, over = above ? { title: [title, y.label].filter(Boolean).join(": "), y: { ...y, name: y.label, label: " " } } : { title, y };
-  const chart = new Chart(element, { x, height, named: true, group: charts, ...over });
   // of a line with marks the marks are dots of their own
   const dotted = lines.filter((line) => line.marker).map((line) => ({ ...line, dots: line.marker === "." ? 4 : 6 }));
-  chart.set([...lines.filter((line) => line.width !== 0), ...dotted], shades);
+  new Chart(element, { x, height, named: true, group: charts, lines: [...lines.filter((line) => line.width !== 0), ...dotted], shades, ...over });
 };
 
 /** One figure: charts of its panels, or its picture with zoom and values. */
@@ -85,7 +76,7 @@ const pictured = (element, view, image, panels, tool, tools) => {
   const hide = () => { marker.hidden = values.hidden = true; };
   const move = (across, down) => { view.scrollBy(across, down); hide(); };
   const zoom = (factor, at = size().map((one) => one / 2)) => {
-    const next = Math.min(20, Math.max(1, scale * factor)), to = shift().map((one, i) => (one + at[i]) * next / scale - at[i]);
+    const next = clamped(scale * factor, 1, 20), to = shift().map((one, i) => (one + at[i]) * next / scale - at[i]);
     scale = next;
     image.style.width = scale === 1 ? "" : `${100 * scale}%`;
     view.classList.toggle("zoomed", scale > 1);
@@ -121,7 +112,7 @@ const pictured = (element, view, image, panels, tool, tools) => {
     else if (step && event.shiftKey) move(40 * step[0], 40 * step[1]);
     else if (step) {
       const most = size();
-      cursor = (cursor ?? most.map((one) => one / 2)).map((one, i) => Math.min(most[i], Math.max(0, one + 8 * step[i])));
+      cursor = (cursor ?? most.map((one) => one / 2)).map((one, i) => clamped(one + 8 * step[i], 0, most[i]));
       show(cursor);
       spoken.textContent = values.hidden ? "" : values.textContent;
     } else return;

@@ -19,8 +19,16 @@ const text = (value) => {
 const textBetween = (value, [low, high]) =>
   Number.isFinite(value) && high - low < 0.05 * Math.abs(value) ? String(Number(value.toPrecision(9))) : text(value);
 const withUnit = (name, unit) => (unit ? `${name} (${unit})` : name);
-/** Numbers that are float32 in base64. */
-const unpacked = (bytes) => new Float32Array(Uint8Array.from(atob(bytes), (one) => one.charCodeAt(0)).buffer);
+/** Bytes, and numbers that are float32, of base64. */
+const bytesIn = (base64) => Uint8Array.from(atob(base64), (one) => one.charCodeAt(0));
+const unpacked = (base64) => new Float32Array(bytesIn(base64).buffer);
+const clamped = (value, low, high) => Math.min(high, Math.max(low, value));
+
+/** Shares of an axis's length as values, and back. */
+const along = ({ ends, log }) => {
+  const [map, back] = log ? [Math.log, Math.exp] : [Number, Number], [low, high] = ends.map(map);
+  return { share: (value) => (map(value) - low) / (high - low), value: (share) => back(low + share * (high - low)) };
+};
 
 /** The largest index whose value is not beyond x. */
 const before = (values, x) => {

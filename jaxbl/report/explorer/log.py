@@ -55,7 +55,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     units = _units(summary)
     frame = trace.assign(**_turns(trace, units))
     if "single_run" in summary:
-        frame = frame.assign(**_errors(frame)).rename(columns={"z": "twist"})
+        frame = frame.assign(**observer_errors(frame)).rename(columns={"z": "twist"})
     coordinates = list(_coordinates(frame, units))
     is_watch = "alarm_gap" in summary
     asked = _watch_groups(summary, frame) if is_watch else _groups(summary, frame, units)
@@ -82,7 +82,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     }
 
 
-def _errors(trace: DataFrame) -> JsonObject:
+def observer_errors(trace: DataFrame) -> JsonObject:
     """Compute what the observers of a simulated run are off by: true less observed."""
     names = [f"{side}.{name}" for side in POSITION_CHANNELS for name in ("position", "velocity")]
     return {f"{name}_error": trace[name] - trace[f"{name}_estimate"] for name in names if f"{name}_estimate" in trace}

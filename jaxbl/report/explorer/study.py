@@ -26,6 +26,7 @@ from jaxbl.sweeps.trial import run, run_perturbed
 
 from .folder import Source, colours_of, drawable, page_values, points_writer, write_page
 from .grid import dimensions, write_grid
+from .log import observer_errors
 
 
 def study_source(folder: str | Path, sentences: Sequence[str] = ()) -> Source:
@@ -143,7 +144,7 @@ _MOST_SAMPLES = 20_000
 _COLUMNS = (
     *("t", "u", "z", "torque"),
     *(f"{side}.{name}" for side in ("motor", "load") for name in (
-        "position", "velocity", "position_estimate", "velocity_estimate", "torque_estimate")),
+        "position", "velocity", "position_estimate", "velocity_estimate", "torque_estimate", "velocity_error")),
 )  # fmt: skip
 
 
@@ -173,7 +174,7 @@ def simulated(config: Config, asked: Any) -> JsonObject:
     point, seed = point_of(config, asked)
     trial = run(point, seed=seed, backend="scan")
     step = -(-len(trial.trace) // _MOST_SAMPLES)
-    trace = trial.trace.iloc[::step]
+    trace = trial.trace.assign(**observer_errors(trial.trace)).iloc[::step]
     planes = {}
     for side, judged in trial.summary["conditions"].items():
         path = error_path(trial.trace, side, judged)

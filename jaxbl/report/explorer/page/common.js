@@ -26,6 +26,7 @@ const savePicture = (name, element) => {
   }
   save(name, sheet.toDataURL("image/png"));
 };
+const addFigure = (parent) => parent.appendChild(made("figure"));
 const choose = (label, id, options, chosen, act) => made("label", {}, label, made("select", { id, onchange: ({ target }) => act(target.value) },
   ...options.map(([value, name]) => made("option", { value, textContent: name, selected: String(value) === String(chosen) }))));
 const tableOf = (element, heads, rows) => element.replaceChildren(
@@ -41,7 +42,7 @@ const address = {
 addEventListener("hashchange", () => location.reload());
 
 /** Title, what was found, and the config. */
-const head = ({ title, lead, config, file }) => {
+const showHead = ({ title, lead, config, file }) => {
   const lines = lead.map((line) => made("p", { textContent: line })), more = lines.splice(1);
   document.title = $("title").textContent = title;
   $("lead").replaceChildren(...lines, ...(more.length ? [made("details", {}, made("summary", { textContent: "more of what was found" }), ...more)] : []));
@@ -49,23 +50,25 @@ const head = ({ title, lead, config, file }) => {
   $("configname").textContent = file;
 };
 
-const waiting = new Map();
-/** Called by the scripts that carry a Parquet file for pages opened from disk. */
-globalThis.jaxblBytes = (number, content) => { waiting.get(number)(Uint8Array.from(atob(content), (one) => one.charCodeAt(0))); };
+/** Parts of a Parquet file beside a page opened from disk: each is in a script, which calls this. */
+const parts = new Map();
+globalThis.jaxblBytes = (number, content) => { parts.get(number).resolve(bytesIn(content)); };
+const loadPart = (number) => {
+  if (!parts.has(number)) {
+    const part = Promise.withResolvers(), src = `points.${String(number).padStart(4, "0")}.js`;
+    parts.set(number, part);
+    document.head.append(made("script", { src, onerror: () => part.reject(new Error(`${src} is missing`)) }));
+  }
+  return parts.get(number).promise;
+};
 
 /** The Parquet file beside the page as hyparquet reads it; of a page opened from disk, by scripts with a part each. */
 const bytesOf = async ({ bytes: byteLength, script: size }) => {
   if (location.protocol !== "file:") return hyparquet.asyncBufferFromUrl({ url: "points.parquet", byteLength });
-  const kept = new Map();
-  const part = (number) => new Promise((resolve, reject) => {
-    waiting.set(number, resolve);
-    const element = made("script", { src: `points.${String(number).padStart(4, "0")}.js`, onerror: () => reject(new Error(`${element.src} is missing`)) });
-    document.head.append(element);
-  });
   const slice = async (start, end = byteLength) => {
     const first = Math.floor(start / size), out = new Uint8Array(end - start);
-    for (let i = first; i * size < end; i++) if (!kept.has(i)) kept.set(i, part(i));
-    for (let i = first; i * size < end; i++) out.set((await kept.get(i)).subarray(Math.max(start - i * size, 0), end - i * size), Math.max(i * size - start, 0));
+    const read = await Promise.all(Array.from({ length: Math.ceil(end / size) - first }, (_, k) => loadPart(first + k)));
+    read.forEach((part, k) => out.set(part.subarray(Math.max(start - (first + k) * size, 0), end - (first + k) * size), Math.max((first + k) * size - start, 0)));
     return out.buffer;
   };
   return { byteLength, slice };
@@ -73,8 +76,8 @@ const bytesOf = async ({ bytes: byteLength, script: size }) => {
 
 /** Columns of the Parquet file beside the page, each read when it is asked for. */
 class Columns {
-  /** `most` columns are kept; `told` hears the share that is read. */
-  constructor(about, most, told) { Object.assign(this, { rows: about.rows, file: bytesOf(about), most, told, kept: new Map() }); }
+  /** `most` columns are kept. */
+  constructor(about, most) { Object.assign(this, { rows: about.rows, file: bytesOf(about), most, kept: new Map() }); }
   get(name, Kind = Float32Array) {
     if (!this.kept.has(name)) {
       if (this.kept.size >= this.most) this.kept.delete(this.kept.keys().next().value);
@@ -92,7 +95,7 @@ class Columns {
       const rowEnd = rowStart + Number(group.num_rows);
       // the page stays alive
       await new Promise((resolve) => setTimeout(resolve));
-      this.told(name, rowStart / this.rows);
+      $("state").textContent = `reading ${name}: ${Math.floor((100 * rowStart) / this.rows)} %`;
       await hyparquet.parquetRead({ file, metadata, columns: [name], rowStart, rowEnd, onChunk: (chunk) => out.set(chunk.columnData, chunk.rowStart) });
       rowStart = rowEnd;
     }
@@ -110,7 +113,7 @@ const coloursOf = (about) => about.colours.map((one) => [1, 3, 5].map((i) => par
 /** Colours of values from low to high: { colours, low, high, log, label, unit, names }, colours as [red, green, blue]; names as of
  * an axis. */
 class Scale {
-  constructor(given) { Object.assign(this, given); }
+  constructor(given) { Object.assign(this, given, { share: along({ ends: [given.low, given.high], log: given.log }).share }); }
   /** Of finite values; logarithmic where they are positive and span more than a factor of 30. Of many, a hundredth at either end
    * lies beyond the colours. */
   static of(values, about) {
@@ -125,16 +128,14 @@ class Scale {
     if (low === high) [low, high] = [low - 0.5 * Math.abs(low) - 1e-12, high + 0.5 * Math.abs(high) + 1e-12];
     return new Scale({ one, whole, low, high, log: low > 0 && high / low > 30, ...about });
   }
-  share(value) { return this.log ? Math.log(value / this.low) / Math.log(this.high / this.low) : (value - this.low) / (this.high - this.low); }
-  colour(value) { return Number.isFinite(value) ? this.colours[Math.round(255 * Math.min(1, Math.max(0, this.share(value) || 0)))] : MISSING; }
+  colour(value) { return Number.isFinite(value) ? this.colours[Math.round(255 * clamped(this.share(value) || 0, 0, 1))] : MISSING; }
   /** What it says. */
   get said() { return this.one || `from ${text(this.whole[0])} to ${text(this.whole[1])}`; }
   /** A bar with round values below it, and with what it shows above. */
   draw(element) {
     const { low, high, log, one, label, unit } = this, names = one ? new Map([[(low + high) / 2, one]]) : this.names;
-    const bar = new Chart(element, { x: { ends: [low, high], log, names }, y: { ends: [0, 1], hidden: true }, height: 48, title: withUnit(label, unit) });
-    bar.cells = { x: [low, high], y: [0, 1], size: [256, 1], colours: sheetOf([256, 1], (k) => [...this.colours[k], 255]), text: () => null };
-    bar.set([]);
+    const cells = { x: [low, high], y: [0, 1], size: [256, 1], colours: sheetOf([256, 1], (k) => [...this.colours[k], 255]), text: () => null };
+    new Chart(element, { x: { ends: [low, high], log, names }, y: { ends: [0, 1], hidden: true }, cells, height: 48, title: withUnit(label, unit) });
     element.inert = true;
   }
 }

@@ -20,7 +20,7 @@ const drawnFigure = ({ yes, size }, raw) => (yes ? Number(raw) : raw === null ? 
 class Runs {
   /** `changed` hears that other runs are pinned. */
   constructor(study, changed = () => {}) {
-    Object.assign(this, { study, changed, all: [], plots: [] });
+    Object.assign(this, { study, changed, all: [] });
     $("against").onchange = () => this.draw();
     $("runcsv").onclick = () => saveTable("run.csv", this.newest.columns);
     $("runpicture").onclick = () => savePicture("run.png", $("runs"));
@@ -51,9 +51,6 @@ class Runs {
     this.all = this.all.filter((one) => one.pinned && one.row !== row);
     if (this.all.length === COLOURS.length) this.all.shift();
     const columns = Object.fromEntries(Object.entries(found.columns).map(([name, bytes]) => [name, unpacked(bytes)]));
-    for (const side of SIDES.filter((one) => `${one}.velocity` in columns)) {
-      columns[`${side}.velocity_error`] = columns[`${side}.velocity`].map((one, i) => one - columns[`${side}.velocity_estimate`][i]);
-    }
     const name = [...this.study.named.map((path) => `${path.replace(/^observer\./, "")} ${text(values[path])}`), `seed ${seed}`].join(", ");
     this.newest = { ...found, row, name, columns, colour: COLOURS.find((colour) => !this.all.some((one) => one.colour === colour)), pinned: false };
     this.all.push(this.newest);
@@ -85,11 +82,8 @@ class Runs {
     $("traces").replaceChildren();
     const plots = [], group = (this.group = []);
     const add = (spec, lines) => {
-      const figure = made("figure");
-      $("traces").append(figure);
-      const plot = new Chart(figure, { height: 128, ...spec, title: apart ? `${spec.title}, pinned less newest` : spec.title, ...(spec.time ? { group } : {}) });
-      if (spec.time && range) plot.range = [range[0], null];
-      plots.push([plot, lines]);
+      const title = apart ? `${spec.title}, pinned less newest` : spec.title, together = spec.time ? { group, range: range ? [range[0], null] : null } : {};
+      plots.push({ height: 128, ...spec, title, lines, ...together });
     };
     const named = (run, name) => (others.length ? `${run.name}: ${name}` : name);
     for (const spec of tracePlots(newest.columns).filter((one) => !apart || one.time)) {
@@ -112,8 +106,8 @@ class Runs {
       }));
     }
     // their widths are known when all are there
-    for (const [plot, lines] of plots) plot.set(lines);
-    this.plots = plots.map(([plot]) => plot);
+    const figures = plots.map(() => addFigure($("traces")));
+    this.plots = plots.map((given, i) => new Chart(figures[i], given));
     const { metrics } = newest, cell = (name, own) => (typeof own[name] === "boolean" ? (own[name] ? "yes" : "no") : text(drawnFigure(this.study.metric(name) ?? {}, own[name])));
     tableOf($("metrics"), ["metric", ...this.all.map((one) => one.name)], Object.keys(metrics).map((name) => [this.study.metric(name)?.label ?? name, ...this.all.map((one) => cell(name, one.metrics))]));
   }

@@ -7,24 +7,19 @@ class Study {
   constructor(about) {
     Object.assign(this, about);
     // of very many rows few columns fit into memory
-    this.columns = new Columns(about, about.rows > 2e6 ? 8 : 40, (name, share) => { $("state").textContent = `reading ${name}: ${Math.floor(100 * share)} %`; });
+    this.columns = new Columns(about, about.rows > 2e6 ? 8 : 40);
     this.colours = coloursOf(about);
-    this.fields = new Map();
-    this.dims = about.grid ? about.axes.map((axis, i) => dimension(axis, i)) : [];
-    let stride = 1;
-    for (const dim of [...this.dims].reverse()) { dim.stride = stride; stride *= dim.size; }
+    const sizes = about.grid ? about.axes.map(({ paths: [{ values }] }) => values.length) : [];
+    this.dims = sizes.map((_, i) => dimension(about.axes[i], i, sizes.slice(i + 1).reduce((a, b) => a * b, 1)));
     const stored = (name, Kind) => async () => { const column = await this.columns.get(name, Kind); return (row) => column[row]; };
-    for (const dim of this.dims) {
-      for (const { path, label, unit, values } of dim.paths) {
-        const names = values.every(Number.isFinite) ? null : values, at = (row) => Math.floor(row / dim.stride) % dim.size;
-        this.fields.set(path, { name: path, label, unit, names, log: dim.log, varied: dim.size > 1, read: async () => (names ? at : (row) => values[at(row)]) });
-      }
-    }
-    for (const { path, label, unit, words, log } of about.grid ? [] : [...about.axes, { path: "seed", label: "seed", unit: "" }]) {
-      this.fields.set(path, { name: path, label, unit, names: words, log, varied: true, read: stored(path, Float64Array) });
-    }
-    for (const metric of about.metrics) this.fields.set(metric.name, { ...metric, unit: "", metric: true, read: stored(metric.name, Float32Array) });
-    this.axes = [...this.fields.values()].filter((one) => !one.metric);
+    const ofGrid = ({ size, log, indexOf, paths }) => paths.map(({ path: name, label, unit, values }) => {
+      const names = values.every(Number.isFinite) ? null : values;
+      return { name, label, unit, names, log, varied: size > 1, read: async () => (names ? indexOf : (row) => values[indexOf(row)]) };
+    });
+    const ofTable = ({ path: name, label, unit, words: names, log }) => ({ name, label, unit, names, log, varied: true, read: stored(name, Float64Array) });
+    this.axes = about.grid ? this.dims.flatMap(ofGrid) : [...about.axes, { path: "seed", label: "seed", unit: "" }].map(ofTable);
+    const metrics = about.metrics.map((one) => ({ ...one, unit: "", metric: true, read: stored(one.name, Float32Array) }));
+    this.fields = new Map([...this.axes, ...metrics].map((one) => [one.name, one]));
     this.named = this.axes.filter((one) => one.varied && one.name !== "seed").map((one) => one.name);
   }
   metric(name) { return this.metrics.find((one) => one.name === name); }
@@ -58,34 +53,30 @@ class Study {
     }));
     const out = new Uint8Array(this.rows);
     for (const all of terms) {
-      const read = await Promise.all(all.map(({ field }) => field.read())), { length } = all;
-      for (let row = 0; row < this.rows; row++) {
-        let passed = 1;
-        for (let k = 0; passed && k < length; k++) passed = all[k].passes(read[k](row)) ? 1 : 0;
-        out[row] |= passed;
-      }
+      const read = await Promise.all(all.map(({ field }) => field.read()));
+      for (let row = 0; row < this.rows; row++) if (all.every(({ passes }, k) => passes(read[k](row)))) out[row] = 1;
     }
     return out;
   }
 }
 
-/** A dimension of a grid: along evenly spaced values it is drawn as they are, else as their numbers. */
-const dimension = ({ paths }, i) => {
-  const { path, label, unit, values } = paths[0], size = values.length, numbers = values.every(Number.isFinite);
-  const even = (map) => values.every((one, k) => k === 0 || (one > values[k - 1] && Math.abs(map(one) - map(values[k - 1]) - (map(values[size - 1]) - map(values[0])) / (size - 1)) < 1e-3 * Math.abs(map(values[1]) - map(values[0]))));
-  const positive = numbers && values[0] > 0, log = positive && size > 2 && even(Math.log) && values[size - 1] / values[0] > 3, linear = !log && numbers && size > 1 && even((one) => one);
-  const spaced = log || linear, map = log ? Math.log : (one) => one, back = log ? Math.exp : (one) => one, first = spaced ? map(values[0]) : 0, step = spaced ? map(values[1]) - first : 1;
+/** A dimension of a grid, whose places are so many rows apart: along evenly spaced values it is drawn as they are, else as their
+ * numbers. */
+const dimension = ({ paths }, i, stride) => {
+  const { path, label, unit, values } = paths[0], size = values.length, last = size - 1, ends = [values[0], values[last]], ratio = values[0] > 0 ? ends[1] / ends[0] : 0;
+  const rising = values.every((one, k) => Number.isFinite(one) && (!k || one > values[k - 1]));
+  const isEven = ({ share }) => size > 1 && rising && values.every((one, k) => Math.abs(share(one) * last - k) < 1e-3);
+  const log = size > 2 && ratio > 3 && isEven(along({ ends, log: true })), spaced = log || isEven(along({ ends })), scale = spaced ? along({ ends, log }) : along({ ends: [0, 1] }), steps = spaced ? last : 1;
   // between values that are not even, in their own scale
-  const own = positive && values[size - 1] / values[0] > 20 ? Math.log : (one) => one, rising = numbers && values.every((one, k) => !k || one > values[k - 1]);
   const between = (value) => {
-    const k = Math.max(1, values.findIndex((one) => one >= value) < 0 ? size - 1 : values.findIndex((one) => one >= value));
-    return k - 1 + (own(value) - own(values[k - 1])) / (own(values[k]) - own(values[k - 1]));
+    const k = Math.min(before(values, value), last - 1);
+    return k + along({ ends: [values[k], values[k + 1]], log: ratio > 20 }).share(value);
   };
   return {
-    i, size, paths, name: paths.map((one) => one.path).join(", "), path, values, seed: path === "seed", log, rising,
+    i, size, stride, paths, name: paths.map((one) => one.path).join(", "), path, values, seed: path === "seed", log, rising,
     axis: { label: paths.length > 1 ? `${label}, with ${paths.slice(1).map((one) => one.path).join(", ")}` : label, key: path, log, names: spaced ? null : values.map(text) },
-    /** Where a place along the axis is drawn, and which one is drawn there; where a value is. */
-    edge: (k) => back(first + step * k), index: (at) => Math.min(size - 1, Math.max(0, Math.round((map(at) - first) / step))),
+    /** The place of a row along the axis; where a place is drawn, and which one is drawn there; where a value is. */
+    indexOf: (row) => Math.floor(row / stride) % size, edge: (k) => scale.value(k / steps), index: (at) => clamped(Math.round(scale.share(at) * steps), 0, last),
     place: (value) => (spaced ? value : between(value)),
     said: (k) => paths.map((one) => `${text(one.values[k])} ${one.unit}`.trim()).join(", "),
   };
@@ -93,10 +84,7 @@ const dimension = ({ paths }, i) => {
 
 /** One number of several, nan left out. */
 const reduced = {
-  median: (values) => {
-    const middle = values.sort().length >> 1;
-    return values.length % 2 ? values[middle] : 0.5 * (values[middle - 1] + values[middle]);
-  },
+  median: (values) => 0.5 * (values.sort()[(values.length - 1) >> 1] + values[values.length >> 1]),
   mean: (values) => (values.length ? values.reduce((a, b) => a + b, 0) / values.length : NaN),
   least: (values) => (values.length ? values.reduce((a, b) => Math.min(a, b)) : NaN),
   largest: (values) => (values.length ? values.reduce((a, b) => Math.max(a, b)) : NaN),
@@ -110,29 +98,26 @@ const mapped = (study, column, view, mask = null) => {
   const cells = size.map((one, i) => Math.ceil(one / step[i]));
   // where points lie that a cell is made of
   let offsets = [0];
-  for (const dim of study.dims) {
-    if (dim === x || dim === y) continue;
-    const along = view.at[dim.i] === "all" ? Array.from({ length: dim.size }, (_, i) => i * dim.stride) : [view.at[dim.i] * dim.stride];
-    offsets = offsets.flatMap((one) => along.map((more) => one + more));
+  for (const dim of study.dims.filter((one) => one !== x && one !== y)) {
+    const places = view.at[dim.i] === "all" ? [...dim.values.keys()] : [view.at[dim.i]];
+    offsets = offsets.flatMap((one) => places.map((place) => one + place * dim.stride));
   }
   const values = new Float32Array(cells[0] * cells[1]), out = mask && new Uint8Array(values.length), gathered = new Float32Array(offsets.length * step[0] * step[1]), how = reduced[view.how];
-  for (let j = 0; j < cells[1]; j++) {
-    for (let i = 0; i < cells[0]; i++) {
-      let count = 0, passed = 0;
-      for (let b = from[1] + j * step[1]; b < Math.min(from[1] + (j + 1) * step[1], to[1]); b++) {
-        for (let a = from[0] + i * step[0]; a < Math.min(from[0] + (i + 1) * step[0], to[0]); a++) {
-          const base = a * x.stride + b * y.stride;
-          for (let k = 0; k < offsets.length; k++) {
-            if (mask && !mask[base + offsets[k]]) continue;
-            passed++;
-            const value = column[base + offsets[k]];
-            if (value === value) gathered[count++] = value;
-          }
+  for (let cell = 0; cell < values.length; cell++) {
+    const left = from[0] + (cell % cells[0]) * step[0], low = from[1] + Math.floor(cell / cells[0]) * step[1];
+    let count = 0, passed = 0;
+    for (let j = low; j < Math.min(low + step[1], to[1]); j++) {
+      for (let i = left; i < Math.min(left + step[0], to[0]); i++) {
+        for (const offset of offsets) {
+          const row = i * x.stride + j * y.stride + offset;
+          if (mask && !mask[row]) continue;
+          passed++;
+          if (!Number.isNaN(column[row])) gathered[count++] = column[row];
         }
       }
-      values[j * cells[0] + i] = count === 1 ? gathered[0] : how(gathered.subarray(0, count));
-      if (out && !passed) out[j * cells[0] + i] = 1;
     }
+    values[cell] = count === 1 ? gathered[0] : how(gathered.subarray(0, count));
+    if (out && !passed) out[cell] = 1;
   }
   return { values, cells, step, out };
 };

@@ -28,16 +28,14 @@ class View {
     scale.draw($("bar"));
     $("plot").className = count > 1 ? "plots several" : "plots";
     $("plot").replaceChildren(...all);
-    this.height = count > 1 ? 250 : Math.max(300, Math.min(560, innerHeight - $("plot").getBoundingClientRect().top - scrollY - 60));
+    this.height = count > 1 ? 250 : clamped(innerHeight - $("plot").getBoundingClientRect().top - scrollY - 60, 300, 560);
     return all;
   }
   /** Marks the chosen row, by its place. */
   mark() {
     const { row } = this.page.view;
-    this.chart.marks = row === "" ? [] : this.places(Number(row)).map((place) => [...place, "ring"]);
-    this.chart.draw();
+    this.chart.mark(row === "" ? [] : this.places(Number(row)).map((place) => [...place, "ring"]));
   }
-  shows() { return () => true; }
 }
 
 /** Maps of a metric over two axes of a grid: one, or one of each value of a third axis. */
@@ -45,10 +43,10 @@ class Maps extends View {
   get view() {
     const { view, study } = this.page, [x, y] = ["x", "y"].map((name) => study.dims.find((dim) => dim.path === view[name]) ?? study.dims[study.start[name]]);
     // an address may have anything
-    const clipped = (one, most) => Math.min(Math.max(Math.trunc(one) || 0, 0), most);
+    const clipped = (one, most) => clamped(Math.trunc(one) || 0, 0, most);
     const at = study.dims.map((dim) => { const own = view[`at.${dim.path}`] ?? (dim.seed ? "all" : study.start.at[dim.i]); return own === "all" ? own : clipped(own, dim.size - 1); });
     const ends = (view.region ?? "").split("~").map((one, k) => clipped(one, [x, y][k % 2].size)), whole = ends.length !== 4 || ends[0] >= ends[2] || ends[1] >= ends[3];
-    return { x, y, at, how: study.metric(view.metric)?.yes ? "mean" : view.how, facet: study.dims.find((dim) => dim.path === view.facet && dim !== x && dim !== y) ?? null, most: [0, 0].fill(Math.max(200, Math.min($("plot").clientWidth, 1024))),
+    return { x, y, at, how: study.metric(view.metric)?.yes ? "mean" : view.how, facet: study.dims.find((dim) => dim.path === view.facet && dim !== x && dim !== y) ?? null, most: [0, 0].fill(clamped($("plot").clientWidth, 200, 1024)),
       from: whole ? [0, 0] : ends.slice(0, 2), to: whole ? [x.size, y.size] : ends.slice(2) };
   }
   form(pick) {
@@ -94,89 +92,82 @@ class Maps extends View {
     return [
       facet && facet.size > panels.length ? `${panels.length} of ${facet.size} values of ${facet.name}.` : "",
       panels.some(({ failed }) => failed?.some((one) => one < 0.5)) ? `Hatched: the ${own} observer did not converge${at.includes("all") ? " in most runs" : ""}.` : "",
-      known.length ? `f⁺ = ${known.join("; ")} rad/s²: the median of what is shown.` : "", this.stars.some(Boolean) ? "★: the best gains." : "",
+      known.length ? `f⁺ = ${known.join("; ")} rad/s²: the median of what is shown.` : "", this.panels.some(({ star }) => star) ? "★: the best gains." : "",
     ].filter(Boolean).join(" ");
   }
   /** Least lambda over alpha of a condition, at a bound f_plus. */
   curve(bound, { x, y }, name) {
     if (!(bound > 0)) return null;
-    const { alpha, lambda, title } = this.study.conditions.find((one) => one.name === name), points = [alpha.map((one) => one * bound), lambda.map((one) => one * Math.sqrt(bound))];
-    const [a, b] = x.path.endsWith(".alpha") ? points : [...points].reverse();
-    return { title, x: a.map((one) => x.place(one)), y: b.map((one) => y.place(one)) };
+    const { alpha, lambda, title } = this.study.conditions.find((one) => one.name === name);
+    const places = (dim) => (dim.path.endsWith(".alpha") ? alpha.map((one) => dim.place(one * bound)) : lambda.map((one) => dim.place(one * Math.sqrt(bound))));
+    return { title, x: places(x), y: places(y) };
   }
   draw(panels) {
-    const { study, page } = this, { metric, log } = page.view, { facet } = this.view, several = panels.length > 1;
+    const { study, page } = this, { metric, log } = page.view, { facet } = this.view;
     const scale = (this.scale = scaleOf(study, metric, panels.flatMap(({ shown }) => [...shown.values]), log !== "linear")), figures = this.figures(scale, panels.length);
-    this.stars = [];
     this.panels = panels.map((panel, number) => {
-      const { view, shown: { values, cells, step, out }, failed, curve } = panel, { x, y, from, to } = view;
-      const ends = [[x, 0], [y, 1]].map(([dim, i]) => [dim.edge(from[i] - 0.5), dim.edge(to[i] - 0.5)]);
-      const chart = new Chart(figures[number], {
-        x: { ...x.axis, ends: ends[0] }, y: { ...y.axis, ends: ends[1] }, height: this.height, scale,
-        title: several ? `${facet.name} = ${facet.said(view.at[facet.i])}` : "",
-        zoomed: (range) => page.change({ region: range ? [0, 1].flatMap((end) => [x, y].map((dim, i) => (range[i] ? dim.index(range[i][end]) + end : [from, to][end][i]))).join("~") : "" }),
-        picked: (found) => { const cell = found.place ? [x.index(found.place[0]), y.index(found.place[1])] : this.cursor?.cell; if (cell) page.take(this.row(view, cell)); },
-      });
+      const { view, shown: { values, cells, step, out }, failed, curve } = panel, { x, y, from, to } = view, here = facet ? `${facet.name} = ${facet.said(view.at[facet.i])}` : "";
+      const ends = [x, y].map((dim, i) => [dim.edge(from[i] - 0.5), dim.edge(to[i] - 0.5)]);
       const lines = (cell) => [`${study.metric(metric).label}: ${out?.[cell[1] * cells[0] + cell[0]] ? "left out by the filter" : text(values[cell[1] * cells[0] + cell[0]])}`,
-        ...[x, y].map((dim, i) => `${dim.name}: ${dim.said(Math.min(from[i] + cell[i] * step[i], to[i] - 1))}`), ...(facet ? [`${facet.name} = ${facet.said(view.at[facet.i])}`] : [])];
-      chart.cells = {
+        ...[x, y].map((dim, i) => `${dim.name}: ${dim.said(Math.min(from[i] + cell[i] * step[i], to[i] - 1))}`), here].filter(Boolean);
+      const drawn = {
         size: cells, x: [ends[0][0], x.edge(from[0] + cells[0] * step[0] - 0.5)], y: [ends[1][0], y.edge(from[1] + cells[1] * step[1] - 0.5)], text: lines,
         colours: sheetOf(cells, (k) => (out?.[k] ? null : [...scale.colour(values[k]), 255])), hatched: failed?.some((one) => one < 0.5) && sheetOf(cells, (k) => (failed[k] < 0.5 && !out?.[k] ? [0, 0, 0, 255] : null)),
         move: (across, up) => {
           const cell = this.cursor?.chart === chart ? this.cursor.cell : from.map((one, i) => (one + to[i]) >> 1);
-          this.cursor = { chart, cell: cell.map((one, i) => Math.min(to[i] - 1, Math.max(from[i], one + [across, up][i]))) };
+          this.cursor = { chart, cell: cell.map((one, i) => clamped(one + [across, up][i], from[i], to[i] - 1)) };
           this.mark();
           $("state").textContent = lines(this.cursor.cell.map((one, i) => Math.floor((one - from[i]) / step[i]))).join("; ");
         },
       };
-      // outlined, and named where it leaves the map
-      if (curve) chart.drawn = ({ ctx, bbox }) => {
-        const inside = curve.x.findLastIndex((one, k) => { const [left, top] = chart.at(one, curve.y[k], true); return left > bbox.left && left < bbox.left + 0.75 * bbox.width && top > bbox.top + 16 && top < bbox.top + bbox.height; });
-        if (inside < 0) return;
-        const [left, top] = chart.at(curve.x[inside], curve.y[inside], true);
-        Object.assign(ctx, { font: `${12 * devicePixelRatio}px system-ui, sans-serif`, textAlign: "left", textBaseline: "bottom", lineWidth: 3 * devicePixelRatio, strokeStyle: "#000000", fillStyle: "#FFD400", lineJoin: "round" });
-        ctx.strokeText(curve.title, left, top - 4);
-        ctx.fillText(curve.title, left, top - 4);
-      };
-      chart.set(curve ? [["#000000", 4], ["#FFD400", 2]].map(([colour, width]) => ({ x: curve.x, y: curve.y, colour, width })) : []);
+      const chart = new Chart(figures[number], {
+        x: { ...x.axis, ends: ends[0] }, y: { ...y.axis, ends: ends[1] }, cells: drawn, height: this.height, scale, title: here,
+        // outlined, and named where it leaves the map
+        lines: curve ? [["#000000", 4], ["#FFD400", 2]].map(([colour, width]) => ({ ...curve, colour, width })) : [], drawn: curve && ((plot) => this.nameCurve(chart, curve, plot)),
+        zoomed: (range) => page.change({ region: range ? [0, 1].flatMap((end) => [x, y].map((dim, i) => (range[i] ? dim.index(range[i][end]) + end : [from, to][end][i]))).join("~") : "" }),
+        picked: (found) => { const cell = found.place ? [x.index(found.place[0]), y.index(found.place[1])] : this.cursor?.cell; if (cell) page.take(this.row(view, cell)); },
+      });
       const star = study.stars.find((one) => (!this.mask || this.mask[this.row(view, [x, y].map((dim) => one.at[dim.i]))]) && one.metric === metric && [x, y].every((dim) => [study.start.x, study.start.y].includes(dim.i)) && study.dims.every((dim) => [x, y].includes(dim) || dim.seed || view.at[dim.i] === one.at[dim.i]));
-      this.stars.push(star);
       return { chart, view, star };
     });
     this.mark();
   }
+  /** The name of a curve, beside it. */
+  nameCurve(chart, { title, x, y }, { ctx, bbox }) {
+    const isInside = ([left, top]) => left > bbox.left && left < bbox.left + 0.75 * bbox.width && top > bbox.top + 16 && top < bbox.top + bbox.height;
+    const place = x.map((one, k) => chart.at(one, y[k], true)).findLast(isInside);
+    if (!place) return;
+    Object.assign(ctx, { font: `${12 * devicePixelRatio}px system-ui, sans-serif`, textAlign: "left", textBaseline: "bottom", lineWidth: 3 * devicePixelRatio, strokeStyle: "#000000", fillStyle: "#FFD400", lineJoin: "round" });
+    ctx.strokeText(title, place[0], place[1] - 4);
+    ctx.fillText(title, place[0], place[1] - 4);
+  }
   row({ x, y, at }, cell) { return this.study.dims.reduce((sum, dim) => sum + dim.stride * (dim === x ? cell[0] : dim === y ? cell[1] : at[dim.i] === "all" ? 0 : at[dim.i]), 0); }
-  indices(row) { return this.study.dims.map((dim) => Math.floor(row / dim.stride) % dim.size); }
+  indices(row) { return this.study.dims.map((dim) => dim.indexOf(row)); }
   /** The chosen point in all maps, strongest where it lies; the star; the keyboard's cell. */
   mark() {
     const { row } = this.page.view, at = row === "" ? null : this.indices(Number(row));
     for (const { chart, view, star } of this.panels) {
       const { x, y } = view, here = at && this.study.dims.every((dim) => dim === x || dim === y || view.at[dim.i] === "all" || view.at[dim.i] === at[dim.i]);
-      chart.marks = [...(at ? [[x.edge(at[x.i]), y.edge(at[y.i]), here ? "ring" : "ghost"]] : []),
-        ...(this.cursor?.chart === chart ? [[x.edge(this.cursor.cell[0]), y.edge(this.cursor.cell[1]), "ring"]] : []), ...(star ? [[x.edge(star.at[x.i]), y.edge(star.at[y.i]), "star"]] : [])];
-      chart.draw();
+      const cell = this.cursor?.chart === chart && this.cursor.cell;
+      const marks = [at && [at[x.i], at[y.i], here ? "ring" : "ghost"], cell && [...cell, "ring"], star && [star.at[x.i], star.at[y.i], "star"]];
+      chart.mark(marks.filter(Boolean).map(([i, j, kind]) => [x.edge(i), y.edge(j), kind]));
     }
   }
   /** Whether a row is in what is shown. */
   shows() {
     const { x, y, at, facet, from, to } = this.view;
-    return (row) => this.study.dims.every((dim) => {
-      const k = Math.floor(row / dim.stride) % dim.size;
-      return dim === x ? k >= from[0] && k < to[0] : dim === y ? k >= from[1] && k < to[1] : dim === facet || at[dim.i] === "all" || at[dim.i] === k;
-    });
+    const ends = this.study.dims.map((dim) => (dim === x ? [from[0], to[0]] : dim === y ? [from[1], to[1]] : dim === facet || at[dim.i] === "all" ? [0, dim.size] : [at[dim.i], at[dim.i] + 1]));
+    return (row) => this.study.dims.every((dim, i) => dim.indexOf(row) >= ends[i][0] && dim.indexOf(row) < ends[i][1]);
   }
   /** Lines over each axis, through a row. */
   cuts(row) {
-    const { study, view, page: { view: { metric } } } = this, at = this.indices(row), figures = [made("figure"), made("figure")];
-    $("cuts").append(...figures);
+    const { study, view, page: { view: { metric } } } = this, at = this.indices(row), figures = [addFigure($("cuts")), addFigure($("cuts"))];
     return ["x", "y"].map((name, i) => {
       const dim = view[name], from = [at[view.x.i], at[view.y.i]].with(i, 0), to = [at[view.x.i] + 1, at[view.y.i] + 1].with(i, dim.size);
       const { values } = mapped(study, this.column, { ...view, at: study.dims.map((one) => (view.at[one.i] === "all" ? "all" : at[one.i])), from, to, most: [1e9, 1e9] });
       const finite = values.filter(Number.isFinite), log = this.scale.log && reduced.least(finite) > 0 && reduced.largest(finite) > 10 * reduced.least(finite);
-      const chart = new Chart(figures[i], { x: dim.axis, y: { log }, height: 160, title: study.metric(metric).label, picked: ({ i: k }) => this.page.take(row + (k - at[dim.i]) * dim.stride) });
-      chart.marks = [[dim.edge(at[dim.i]), values[at[dim.i]], "ring"]];
-      chart.set([{ name: "", x: [...values.keys()].map((k) => dim.edge(k)), y: values, colour: COLOURS[1], width: 2, sorted: true }]);
-      return chart;
+      const lines = [{ x: [...values.keys()].map(dim.edge), y: values, colour: COLOURS[1], width: 2, sorted: true }], marks = [[dim.edge(at[dim.i]), values[at[dim.i]], "ring"]];
+      return new Chart(figures[i], { x: dim.axis, y: { log }, lines, marks, height: 160, title: study.metric(metric).label, picked: ({ i: k }) => this.page.take(row + (k - at[dim.i]) * dim.stride) });
     });
   }
 }
@@ -196,13 +187,13 @@ class Dots extends View {
     if (!current()) return "";
     const { rows, said } = this.rows(mask, MOST_DOTS), [x, y, shade] = read.map((one) => rows.map(one));
     const axis = (name, values) => { const field = study.fields.get(name), [low, high] = endsOf([values], true); return { ...field, unit: "", key: field.metric ? "" : name, log: log !== "linear" && !field.names && values.every((one) => !(one <= 0)) && (Boolean(field.log) || high / low > 30) }; };
-    const field = study.fields.get(metric), scale = scaleOf(study, metric, shade, log !== "linear"), [figure] = this.figures(scale), chart = new Chart(figure, {
-      x: axis(px, x), y: axis(py, y), height: this.height, scale,
+    const field = study.fields.get(metric), scale = scaleOf(study, metric, shade, log !== "linear"), [figure] = this.figures(scale);
+    const dots = { x, y, shade, dots: rows.length > 5000 ? 3 : 6, said: (i) => [`${field.label}: ${text(field.names?.[shade[i]] ?? shade[i])}`] };
+    this.read = read;
+    this.chart = new Chart(figure, {
+      x: axis(px, x), y: axis(py, y), lines: [dots], range: this.range, height: this.height, scale,
       zoomed: (range) => page.change({ range: range ? range.flatMap((one) => one ?? ["", ""]).join("~") : "" }), picked: ({ i }) => page.take(rows[i]),
     });
-    Object.assign(this, { chart, read });
-    chart.range = this.range.map((one) => one ?? null);
-    chart.set([{ name: "", x, y, shade, dots: rows.length > 5000 ? 3 : 6, said: (i) => [`${field.label}: ${text(field.names?.[shade[i]] ?? shade[i])}`] }]);
     this.mark();
     return said;
   }
@@ -226,16 +217,28 @@ class Parallel extends View {
     if (!current()) return "";
     const { rows, said } = this.rows(mask, MOST_PATHS), values = read.map((one) => rows.map(one)), log = page.view.log !== "linear";
     const axes = values.map((column, k) => {
-      const [low, high] = endsOf([column]), scaled = log && low > 0 && high / low > 30 && !fields[k].names, map = scaled ? Math.log : (one) => one, length = map(high) - map(low) || 1;
-      return { low, high, share: (one) => (map(one) - map(low)) / length, value: (share) => { const one = map(low) + share * length; return scaled ? Math.exp(one) : one; } };
+      const [low, high] = endsOf([column]);
+      return { low, high, ...along({ ends: [low, low === high ? low + 1 : high], log: log && low > 0 && high / low > 30 && !fields[k].names }) };
     });
     const last = fields.findIndex((one) => one.name === page.view.metric), scale = scaleOf(study, page.view.metric, values[last], log), [figure] = this.figures(scale), words = (k, one) => fields[k].names?.[Math.round(one)] ?? text(one);
-    const chart = (this.chart = new Chart(figure, {
-      x: { names: fields.map((one) => one.name.split(".").at(-1)), turn: 25, ends: [-0.4, fields.length - 0.6] }, y: { names: [], ends: [-0.06, 1.06] }, scale, height: 460,
+    // one line of uPlot's for each of some colours, which leaves the window between two points
+    const groups = Map.groupBy(rows.keys(), (i) => { const share = scale.share(values[last][i]); return Number.isFinite(share) ? Math.round(20 * clamped(share, 0, 1)) : -1; });
+    const lines = [...groups].map(([share, members]) => {
+      const x = [], y = [], line = [];
+      for (const i of members) {
+        const own = values.map((column, k) => axes[k].share(column[i]));
+        x.push(-2, ...own.keys(), fields.length + 1, fields.length + 1, -2);
+        y.push(-9e3, ...own, -9e3, -9e3, -9e3);
+        for (let k = 0; k < own.length + 4; k++) line.push(i);
+      }
+      return { x, y, rows: line, colour: `rgb(${(share < 0 ? MISSING : scale.colours[Math.round((255 * share) / 20)]).join(",")})`, width: 1, alpha: rows.length > 400 ? 0.35 : 0.7, said: (i) => values.map((column, k) => `${fields[k].name}: ${words(k, column[line[i]])}`) };
+    });
+    const chart = new Chart(figure, {
+      x: { names: fields.map((one) => one.name.split(".").at(-1)), turn: 25, ends: [-0.4, fields.length - 0.6] }, y: { names: [], ends: [-0.06, 1.06] }, lines, scale, height: 460,
       zoomed: (range) => {
         const k = range && Math.round((range[0]?.[0] + range[0]?.[1]) / 2 || 0);
         if (!range || !fields[k]) return page.change({ filter: "" });
-        const [low, high] = (range[1] ?? [0, 1]).map((share) => Number(axes[k].value(Math.min(1, Math.max(0, share))).toPrecision(4))), { name } = fields[k];
+        const [low, high] = (range[1] ?? [0, 1]).map((share) => Number(axes[k].value(clamped(share, 0, 1)).toPrecision(4))), { name } = fields[k];
         const others = page.view.filter.split(/\s+and\s+/).filter((one) => one && !one.startsWith(`${name} `));
         page.change({ filter: [...others, `${name} >= ${low}`, `${name} <= ${high}`].join(" and ") });
       },
@@ -244,20 +247,8 @@ class Parallel extends View {
         Object.assign(ctx, { globalAlpha: 1, fillStyle: getComputedStyle(document.body).color, font: `${11 * devicePixelRatio}px system-ui, sans-serif`, textAlign: "center" });
         axes.forEach(({ low, high }, k) => { for (const [value, share, side] of [[low, 0, "top"], [high, 1, "bottom"]]) { ctx.textBaseline = side; ctx.fillText(words(k, value), chart.at(k, 0, true)[0], chart.at(0, share, true)[1] + (share ? -3 : 3), bbox.width / fields.length); } });
       },
-    }));
-    // one line of uPlot's for each of some colours, which leaves the window between two points
-    const groups = Map.groupBy(rows.keys(), (i) => { const share = scale.share(values[last][i]); return Number.isFinite(share) ? Math.round(20 * Math.min(1, Math.max(0, share))) : -1; });
-    chart.set([...groups].map(([share, members]) => {
-      const x = [], y = [], line = [];
-      for (const i of members) {
-        const own = values.map((column, k) => axes[k].share(column[i]));
-        x.push(-2, ...own.keys(), fields.length + 1, fields.length + 1, -2);
-        y.push(-9e3, ...own, -9e3, -9e3, -9e3);
-        for (let k = 0; k < own.length + 4; k++) line.push(i);
-      }
-      return { x, y, rows: line, colour: share < 0 ? `rgb(${MISSING.join(",")})` : `rgb(${scale.colours[Math.round((255 * share) / 20)].join(",")})`, width: 1, alpha: rows.length > 400 ? 0.35 : 0.7, said: (i) => values.map((column, k) => `${fields[k].name}: ${words(k, column[line[i]])}`) };
-    }));
-    Object.assign(this, { axes, read });
+    });
+    Object.assign(this, { axes, read, chart });
     this.mark();
     return said;
   }
@@ -338,7 +329,7 @@ class Page {
     if (large && !$("tabled").open) { $("count").textContent = "Points"; $("tabled").ontoggle = () => this.table(); $("csv").onclick = () => { $("tabled").open = true; }; return; }
     const names = [...new Set([...study.axes.filter((one) => one.varied).map((one) => one.name), view.metric, ...["converged", "margin_exact"].map((one) => `${own}.${one}`).filter((one) => !large && study.metric(one))])];
     const columns = Object.fromEntries(await Promise.all(names.map(async (name) => { const field = study.fields.get(name), read = await field.read(); return [name, { field, read }]; })));
-    const { rows, count } = this.shown.rows(mask, large ? 1e5 : 1e6, this.shown.shows()), key = columns[view.metric].read;
+    const { rows, count } = this.shown.rows(mask, large ? 1e5 : 1e6, this.shown.shows?.()), key = columns[view.metric].read;
     $("state").textContent = this.said;
     const values = Float64Array.from(rows, key), order = Uint32Array.from(rows.keys()).sort((a, b) => (values[a] - values[b]) || (values[a] === values[a] ? -1 : 1) - (values[b] === values[b] ? -1 : 1));
     const cell = ({ field, read }, row) => { const value = read(row); return field.names ? field.names[value] : field.yes ? (value ? "yes" : "no") : value; };
@@ -352,7 +343,7 @@ class Page {
   }
   async start() {
     const { study, view } = this;
-    head(study);
+    showHead(study);
     $("hint").textContent = `Move over it to read values, drag to enlarge, double click for the whole. Click a point to ${this.runs ? "simulate its run" : "look at it"}. Grey: no value, as the run diverged, is not there yet, or has no such number.`;
     $("whole").onclick = () => this.change({ region: "", range: "" });
     $("picture").onclick = () => savePicture("picture.png", $("bar").parentNode);
