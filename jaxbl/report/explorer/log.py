@@ -18,9 +18,6 @@ from jaxbl.report.watch import LABELS
 
 from .folder import Source, colours_of, points_writer, write_page
 
-_LABELS = {"t": "time", "u": "input u", "theta_e": "motor position θe", "theta_s": "load position θs", "twist": "twist z",
-           "displacement": "displacement"}  # fmt: skip
-
 
 def log_source(file: Path, title: str, sentences: Sequence[str]) -> Source:
     """Results of `jaxbl identify`, `diagnose`, `simulate` or `watch`, by their summary, with what their page says.
@@ -56,7 +53,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     frame = trace.assign(**_turns(trace, units))
     if "single_run" in summary:
         frame = frame.assign(**observer_errors(frame)).rename(columns={"z": "twist"})
-    coordinates = list(_coordinates(frame, units))
+    coordinates = _coordinates(frame, units)
     is_watch = "alarm_gap" in summary
     asked = _watch_groups(summary, frame) if is_watch else _groups(summary, frame, units)
     groups = [group for group in asked if group["lines"]]
@@ -125,21 +122,18 @@ def _turns(trace: DataFrame, units: Mapping[str, str]) -> dict[str, np.ndarray]:
     }
 
 
-def _coordinates(frame: DataFrame, units: Mapping[str, str]) -> Iterable[dict[str, str]]:
+def _coordinates(frame: DataFrame, units: Mapping[str, str]) -> list[dict[str, str]]:
     """The coordinates that a log may be looked at over."""
     motor = units["motor"]
-    unit_by_name = zip(_LABELS, ("s", _force(motor), motor, units["load"], motor, "rad"), strict=True)
-    for name, unit in unit_by_name:
-        if name in frame:
-            yield {"column": name, "label": _LABELS[name], "unit": unit}
-    for side in POSITION_CHANNELS:
-        for name, label, per in (
-            ("velocity", "speed", "/s"),
-            ("acceleration", "acceleration", "/s²"),
-            ("turn", "position within a turn", ""),
-        ):
-            if f"{side}.{name}" in frame:
-                yield {"column": f"{side}.{name}", "label": f"{side} {label}", "unit": units[side] + per}
+    columns = [
+        ("t", "time", "s"), ("u", "input u", _force(motor)), ("theta_e", "motor position θe", motor),
+        ("theta_s", "load position θs", units["load"]), ("twist", "twist z", motor), ("displacement", "displacement", "rad"),
+    ]  # fmt: skip
+    kinds = ("velocity", "speed", "/s"), ("acceleration", "acceleration", "/s²"), ("turn", "position within a turn", "")
+    columns += [
+        (f"{side}.{name}", f"{side} {label}", units[side] + per) for side in POSITION_CHANNELS for name, label, per in kinds
+    ]
+    return [{"column": column, "label": label, "unit": unit} for column, label, unit in columns if column in frame]
 
 
 _NAMES = {
@@ -178,12 +172,12 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
         lines[f"{side}.observed_before"] = "model as given, by the observer"
         yield group(f"{side}: {quantity}", quantity, _force(unit), lines, bandwidths.get(side))
     for side, unit in units.items():
-        lines = {f"{side}.residual": "measured less the model's"}
-        yield group(f"{side}: position residual", "residual", unit, lines)
-    for side, unit in units.items():
-        for name, per in (("velocity", "/s"), ("position", "")):
-            lines = {f"{side}.{name}_error": "true less observed"}
-            yield group(f"{side}: {name} error", f"{name} error", f"{unit}{per}", lines)
+        for name, quantity, per, label in (
+            ("residual", "position residual", "", "measured less the model's"),
+            ("velocity_error", "velocity error", "/s", "true less observed"),
+            ("position_error", "position error", "", "true less observed"),
+        ):
+            yield group(f"{side}: {quantity}", quantity, unit + per, {f"{side}.{name}": label})
     force = _force(units["motor"])
     lines = {"transmitted": "measured", "torque": law, "torque_by_motor": "by the motor's side"}
     lines |= {f"{side}.torque_estimate": f"by the {side} observer" for side in units}

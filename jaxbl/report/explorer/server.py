@@ -133,10 +133,10 @@ class ExplorerServer(ThreadingHTTPServer):
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
-        folder = self._place / version if version in self._version_names() else None
-        if folder is None or not folder.is_dir():
+        if version not in self._version_names():
             return None
-        return next((file for file in folder.iterdir() if file.name == name and file.is_file()), None)
+        files = (self._place / version).glob("*")
+        return next((file for file in files if file.name == name and file.is_file()), None)
 
     def _version_names(self) -> Iterator[str]:
         return map(str, range(1, self._versions + 1))
