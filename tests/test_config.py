@@ -196,6 +196,10 @@ BAD = {
         rigid_study({"observer.load": {"lambda": 1.0, "alpha": 1.0}}),
         "observer.load has no meaning",
     ),
+    "rigid with damping in a gear": (
+        rigid_study(effects=[{"kind": "transmission.damping", "damping": 1.0}]),
+        "effects[0]: transmission.damping has no meaning on a rigid drive",
+    ),
     "rigid with load effect": (rigid_study(effects=[TABLES["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
     "no transmission": (small_study({"transmission": None}), "[transmission] is missing"),
     "no load observer": (small_study({"observer.load": None}), "observer.load is missing"),

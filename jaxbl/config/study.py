@@ -222,10 +222,12 @@ def _check_sides(config: Config) -> None:
 def _check_effects(config: Config) -> None:
     """Effects act on what the drive has, their numbers agree, and they leave each side some inertia."""
     drive = config.drive.build()
-    places = {*drive.bodies, "actuator", "encoder", *(() if config.transmission is None else ("transmission",))}
+    rigid = "load" not in drive.bodies
     for i, effect in enumerate(config.effects):
         place = effect.kind.partition(".")[0]
-        twice = place == "load" and "load" not in drive.bodies and "motor" in EFFECTS[effect.kind].places
+        twice = place == "load" and rigid and "motor" in EFFECTS[effect.kind].places
+        geared = config.transmission is not None or (rigid and EFFECTS[effect.kind].on_rigid)
+        places = {*drive.bodies, "actuator", "encoder", *(("transmission",) if geared else ())}
         if twice or drive.resolve_place(place) not in places:
             raise table_error(
                 f"effects[{i}]: {effect.kind} has no meaning on a {config.drive.kind} drive; motor.* and actuator.* effects "

@@ -324,9 +324,13 @@ class MotionTorques:
                 torques_of[i] = stored
         for name, indices in asked.items():
             place = self.experiment.drive.resolve_place(effects[indices[0]].place)
-            # of the model's own only those in the gear matter, and only for others there: one structure, and one program
+            # of the model's own only those in the gear matter (of one inertia those on the load), and only for others there:
+            # one structure, and one program
+            near = "load" if self.experiment.transmission is None else "transmission"
             gear = [
-                other for other in self.experiment.effects if other.place == place == "transmission" and other.name != name
+                other
+                for other in self.experiment.effects
+                if place == "transmission" and other.place == near and other.name != name
             ]
             bare = with_effects(self.experiment, tuple(gear))
             # friction of the gear is on the motor's side; an effect on the input needs none
@@ -389,6 +393,10 @@ def _torques(
 
     def act(effect: AbstractEffect) -> dict[int, jax.Array]:
         place = drive.resolve_place(effect.place)
+        if place == "transmission" and experiment.transmission is None:
+            motion = Motion(part.time, part.position["motor"], part.velocity["motor"])
+            carried = experiment.plant.load_torque(effect_path(experiment, along)[0], motion)
+            return {0: -effect.gear_friction((), carried) * direction}
         if place == "transmission":
             models = (experiment, with_effects(experiment, (*experiment.effects, effect)))
             motion = part.position, part.velocity

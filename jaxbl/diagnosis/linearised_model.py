@@ -32,7 +32,7 @@ from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import FreeParameter, set_free_parameters
 from jaxbl.estimation.prediction import kalman_gain
 from jaxbl.estimation.regression import Path, effect_states
-from jaxbl.estimation.segments import Segment
+from jaxbl.estimation.segments import Segment, reading_noise
 from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.compilation import jit
 from jaxbl.fused.linear_predictor import LinearPredictor
@@ -309,7 +309,7 @@ class Linear:
         gain, self._inertia = _figures(self.experiment)
         self.input_gain = float(gain)
         self.drive, self.driven = self._drive()
-        self._scales: dict[str, Scales] = {}
+        self._noise, self._scales = reading_noise(segments), dict[str, Scales]()
         # what the last search chose, and what the one without candidates did, which is asked for again and again
         self._last: tuple[Predictor, list[Forces]] | None = None
         self._alone: tuple[Predictor, list[Forces]] | None = None
@@ -345,7 +345,7 @@ class Linear:
             return np.concatenate([of(signals.part)[signals.real] for signals in self.signals])
 
         side = place if place in self.sides else "motor"
-        position = join(lambda part: part.position["load" if place == "transmission" else side])
+        position = join(lambda part: part.position[self.sides[-1] if place == "transmission" else side])
         ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
         if len(self.sides) == 2:
             twist = join(lambda part: part.position["motor"] - ratio * part.position["load"])
@@ -358,6 +358,7 @@ class Linear:
             speed=rms(join(lambda part: part.velocity[side])),
             spread=float(np.std(position)),
             travel=float(np.ptp(position)),
+            noise=self._noise[side],
             ratio=ratio,
             harmonics=self._harmonics(side),
             wave_count=self._wave_count(side),

@@ -24,15 +24,14 @@ Effect = TypeVar("Effect")
 def candidates(experiment: Experiment) -> list[str]:
     """Names of the effects that a model's drive can have and that the model lacks."""
     present = {effect.name for effect in experiment.effects}
-    places = {*experiment.sides, "load", "actuator"}
-    if experiment.transmission is not None:
-        places.add("transmission")
+    places = {*experiment.sides, "load", "actuator", "transmission"}
     names = []
     for name, cls in EFFECTS.items():
         place = name.partition(".")[0]
         # on a rigid drive the motor has all that both sides may have; only a load has the others
         twice = place == "load" and place not in experiment.sides and "motor" in cls.places
-        if cls.neutral() and place in places and name not in present and not twice:
+        possible = cls.on_rigid or experiment.transmission is not None
+        if cls.neutral() and place in places and possible and name not in present and not twice:
             names.append(name)
     return names
 

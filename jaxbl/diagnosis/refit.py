@@ -130,9 +130,10 @@ class ModelFits:
 
     def unit(self, name: str, leaf: str, effects: EffectNumbers) -> float:
         """Find the value of a size of one of some effects at which its torque is as large as effects are."""
-        # a torque of the gear hangs on the gap that is there
-        beside = effects if _in_gear(name) else {}
-        gear = {effect: numbers for effect, numbers in beside.items() if _in_gear(effect) and effect != name}
+        # a torque of the gear hangs on the gap that is there, or on what the load takes
+        near = "load." if self.nominal.transmission is None else "transmission."
+        beside = effects if name.startswith("transmission.") else {}
+        gear = {effect: numbers for effect, numbers in beside.items() if effect.startswith(near) and effect != name}
         key = name, leaf, *sorted(gear)
         if key not in self._units:
             along = self.linearise(gear, 0.0 * self.prior) if gear else self.given
@@ -179,7 +180,9 @@ class _Fit:
         path = self._path(theta, start, smoothness)
         linear = Linear(self.experiment, self.free, theta, self.width, path)
         predictor = linear.predictor(smoothness)
-        cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
+        # where all is rounding, squares may come out below zero
+        with np.errstate(invalid="ignore"):
+            cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
         return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
 
     def run(self, theta: np.ndarray, begin: FitEnd | None) -> _Point:
@@ -345,10 +348,6 @@ class _Fit:
                 covariance=rows @ fitted.covariance @ rows.T + shared, white=rows @ fitted.white @ rows.T + shared,
             )  # fmt: skip
         return fitted
-
-
-def _in_gear(name: str) -> bool:
-    return name.startswith("transmission.")
 
 
 def _scale(name: str, numbers: Numbers, share: float) -> Numbers:

@@ -199,9 +199,19 @@ class Plant(eqx.Module):
         return torque, ratio
 
     def gear_friction(self, states: EffectStates, transmitted: Scalar) -> Scalar:
-        """Level of the dry friction that the transmitted torque (N m) causes on the motor's side, N m."""
+        """Level of the dry friction that the transmitted torque (N m) causes on the motor's side, N m.
+
+        On a rigid drive that is the torque that gravity and other effects on the load take: how its inertia is divided is
+        not known.
+        """
         in_gear = self._effects_at("transmission", states)
         return sum((effect.gear_friction(state, transmitted) for effect, state in in_gear), 0.0)
+
+    def load_torque(self, states: EffectStates, motion: Motion) -> Scalar:
+        """Torque (N m) that gravity and other effects without a memory take on the load of a rigid drive."""
+        pairs = zip(self.effects, states, strict=True)
+        carried = [(effect, state) for effect, state in pairs if effect.place == "load" and not effect.init()]
+        return sum((effect.resist(state, motion) for effect, state in carried), 0.0)
 
     def _elastic_motion(
         self, position: SideValues, velocity: SideValues, states: EffectStates
@@ -297,7 +307,7 @@ class Plant(eqx.Module):
         if not self.has_memory:
             return states
         motions = {side: Motion(time, position[side], velocity[side]) for side in self.drive.bodies}
-        motions["actuator"] = motions["encoder"] = motions["motor"]
+        motions["actuator"] = motions["encoder"] = motions["transmission"] = motions["motor"]
         if self.transmission is not None:
             # the rate of deflection changes with the position: in the middle of the step it is its mean
             middle = {side: position[side] + 0.5 * step * velocity[side] for side in self.drive.bodies}
@@ -335,6 +345,9 @@ class Plant(eqx.Module):
             law_torque, gains["load"] = self.transmitted_torque(position, velocity, states)
         if transmitted is None:
             transmitted = law_torque
+        carried = transmitted
+        if self.transmission is None and self._effects_at("transmission", states):
+            carried = self.load_torque(states, Motion(time, position["motor"], velocity["motor"]))
         torques, mutual = {}, self.drive.body_torques(position, velocity)
         for side in self.drive.bodies:
             driving = torque if side == "motor" else 0.0
@@ -342,7 +355,7 @@ class Plant(eqx.Module):
                 driving = driving - effect.resist(state, Motion(time, position[side], velocity[side], torque))
             total = gains[side] * transmitted + driving if side in gains else driving
             total = total + mutual[side] if side in mutual else total
-            level: Scalar = self.gear_friction(states, transmitted) if side == "motor" else 0.0
+            level: Scalar = self.gear_friction(states, carried) if side == "motor" else 0.0
             motion = Motion(time, position[side], velocity[side], driving)
             for effect, state in self._effects_at(side, states):
                 total = total - effect.resist(state, motion)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from hidden.bristle import Axis, Drive, simulate
 from hidden.cases import cases
 from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
@@ -93,6 +94,9 @@ def test_a_log_with_a_pause_is_explained_in_parts(tmp_path):
     (finding,) = weigh(explanation)
     assert explanation.largest_gain < LIMITS.unknown and finding.effect == "motor.coulomb_friction"
     assert finding.confidence > 0.99 and finding.alternatives == ()
+    # finer laws are fitted in its place, whatever a screening promises of them
+    tried = {step.change: step.accepted for step in effect_search.history}
+    assert tried["replace motor.coulomb_friction by motor.presliding_friction"] is False
 
 
 HIDDEN = {
@@ -126,6 +130,23 @@ def test_waves_a_turn_are_found_wherever_they_are_and_beside_friction(tmp_path):
     for effect in hidden:
         for key in {"torque", "amplitude", "phase"} & set(effect):
             assert numbers[effect["kind"]][key] == pytest.approx(effect[key], rel=0.03)
+
+
+def test_an_arms_friction_under_load_is_fitted_beside_its_weight(tmp_path):
+    axis = Axis(0.02, 0.03, 0.06, length=3e-5, under_load=0.3, gravity=0.5, hangs=0.2)
+    time = 4e-3 * np.arange(1000)
+    rate = 1.5 * np.cos(2.0 * np.pi * 0.35 * time) + 0.8 * np.cos(2.0 * np.pi * 0.62 * time)
+    drive = Drive(4e-3, 6.0, 0.6, 3.0, 0.5, 2.0, motor_step=1e-4)
+    run = simulate(axis, drive, np.cumsum(rate) * 4e-3, rate, np.ones(len(time), bool))
+    table = np.column_stack([time, run.command, run.readings[:, 0]])
+    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
+    search = prepare_search(tmp_path / "log.csv", nominal_study(run={"sample_period": 4e-3}))
+    begin = {"load.gravity": {"torque": 0.4, "phase": 0.0}, "motor.coulomb_friction": {"torque": 0.03}}
+    begin["transmission.load_friction"] = {"coefficient": 0.1}
+    without, fitted = (search.fits.fit(numbers, np.zeros(2)) for numbers in (dict(list(begin.items())[:2]), begin))
+    assert search.gain(without, fitted).is_accepted
+    assert fitted.numbers["transmission.load_friction"]["coefficient"] == pytest.approx(0.3, rel=0.1)
+    assert fitted.numbers["load.gravity"]["torque"] == pytest.approx(0.5, rel=0.02)
 
 
 def test_zeros_of_encoders_that_do_not_agree_are_found_first(tmp_path):

@@ -84,7 +84,9 @@ def test_own_columns_are_derivatives(sides):
     assert rms(columns.sum(axis=1) - expected) < 1e-3 * rms(expected)
 
 
-LOG = Scales(5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, frequencies=(2.0,), waves=tuple(range(1, 41)), wave_count=40)
+LOG = Scales(
+    5.0, 1e-3, 10.0, 0.1, 0.3, 1.0, 0.2, travel=2.0, noise=1e-5, frequencies=(2.0,), waves=tuple(range(1, 41)), wave_count=40
+)  # fmt: skip
 SMALL_NUMBERS = {
     "motor.coulomb_friction": {"torque": 1e-3},
     "motor.viscous_friction": {"viscous": 1e-4},
@@ -115,6 +117,18 @@ def test_a_candidates_torque_does_what_the_effect_does(geared_model, name):
     actual = columns[:, -1]
     assert rms(expected) > 0.0
     assert rms(actual - expected) < 0.03 * rms(expected)
+
+
+def test_friction_under_load_of_one_inertia_follows_what_its_load_takes():
+    gravity = as_arrays(make_effect("load.gravity", torque=0.5, phase=0.3), float)
+    rubbing = as_arrays(make_effect("transmission.load_friction", coefficient=0.1), float)
+    (loaded,) = linearise(1, lambda experiment: eqx.tree_at(lambda e: e.effects, experiment, (gravity,))).signals
+    (torques,) = loaded.of([rubbing])
+    position, direction = loaded.part.position["motor"], loaded.direction["motor"]
+    expected = -0.1 * np.abs(0.5 * np.sin(position - 0.3)) * direction
+    np.testing.assert_allclose(torques[0], expected[: loaded.samples], atol=1e-12)
+    # without a torque on the load there is none
+    assert not linearise(1).signals[0].of([rubbing])[0][0].any()
 
 
 def test_a_lag_begins_with_what_had_lasted_or_at_rest(geared_model):

@@ -153,6 +153,19 @@ def test_a_load_below_breakaway_does_not_creep_at_all(dtype):
     assert free[-1, 1] < 0.0
 
 
+def test_one_inertia_rubs_by_what_its_load_takes():
+    # an arm held out, m g l = 0.3 N m, in a gear with mu = 0.2: between 0.24 and 0.36 N m it does not move at all
+    effects = make_effects(
+        {"load.gravity": {"torque": 0.3, "phase": -0.5 * np.pi}, "transmission.load_friction": {"coefficient": 0.2}}
+    )
+    arm = make_block(*effects)
+    for torque in (0.241, 0.359):
+        assert not simulate_plant(arm, 10, REST, np.full(100, torque), 1e-3).any()
+    for torque, remaining in ((0.37, 0.01), (0.23, -0.01)):
+        velocity = simulate_plant(arm, 10, REST, np.full(10, torque), 1e-3)[-1, 1]
+        assert velocity == pytest.approx(remaining / 0.05 * 0.01, rel=1e-3)
+
+
 def test_a_block_above_breakaway_accelerates_as_the_closed_form_says():
     time = 1e-3 * np.arange(1, 2001)
     position, velocity = slide_block(COULOMB, -0.11, 2.0)

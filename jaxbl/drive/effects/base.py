@@ -57,6 +57,7 @@ class Scales(NamedTuple):
         speed: rms velocity of the effect's side (of the motor for gear and actuator), rad/s.
         spread: standard deviation of that side's position, rad.
         travel: range of that side's position, rad; for an effect in the gear, of the load's.
+        noise: standard deviation of that side's readings, rad.
         ratio: motor turns for one load turn; 1 on a rigid drive.
         harmonics: periods a turn of the waves over position that the model already has on the side.
         frequencies: of torques on the side that would explain most of the residual torque, Hz.
@@ -72,6 +73,7 @@ class Scales(NamedTuple):
     speed: float
     spread: float
     travel: float
+    noise: float
     ratio: float = 1.0
     harmonics: tuple[float, ...] = ()
     frequencies: tuple[float, ...] = ()
@@ -163,6 +165,7 @@ class AbstractEffect(eqx.Module):
         state_from_input: True if its state is the commanded input, whatever its numbers and the motion.
         state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
         in_time: True if it depends on the time since a log began.
+        on_rigid: True if it has a meaning on a rigid drive.
         rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
         in_log: words that say how it is taken off a log, if it is an error of the recording: a diagnosis asks for it first.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
@@ -176,6 +179,7 @@ class AbstractEffect(eqx.Module):
     state_from_input = False
     state_from_measurement = False
     in_time = False
+    on_rigid = True
     rotary = False
     in_log = ""
     corrects: ClassVar[str | None] = None
@@ -334,6 +338,7 @@ class TransmissionEffect(AbstractEffect):
     """An effect in the gear."""
 
     places = ("transmission",)
+    on_rigid = False
 
 
 class ActuatorEffect(AbstractEffect):

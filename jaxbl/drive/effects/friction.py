@@ -53,9 +53,9 @@ class StribeckFriction(SideEffect):
         return super().possible(numbers) and numbers["breakaway_torque"] > numbers["torque"]
 
 
-_LENGTHS = 0.001, 0.003, 0.01, 0.03, 0.1
-"""Trial values of the pre-sliding length, over the position's standard deviation. On most logs a shorter length looks like
-dry friction, a longer one like a spring."""
+_LENGTHS = {"noise": (1.0, 5.0), "spread": (0.001, 0.003, 0.01, 0.03, 0.1)}
+"""Trial values of the pre-sliding length, over the noise of the readings and over the position's standard deviation. A
+shorter length looks like dry friction, a longer one like a spring."""
 
 
 @EFFECTS.add
@@ -79,7 +79,7 @@ class PreslidingFriction(SideEffect):
     length: Scalar = shape(
         "rad",
         "pre-sliding length l = F_c over the stiffness of the contacts",
-        multiples("spread", _LENGTHS),
+        lambda log: [factor * getattr(log, scale) for scale, factors in _LENGTHS.items() for factor in factors],
         above=0.0,
     )
     # these numbers show only where a drive comes to rest or starts to move

@@ -124,15 +124,16 @@ class Eccentricity(TransmissionEffect):
 @EFFECTS.add
 class LoadFriction(TransmissionEffect):
     """Friction of gear teeth or a screw under load: dry friction mu |C| on the motor's side, where C is the transmitted
-    torque. The efficiency is 1 / (1 + mu) while the motor drives, and 1 - mu while the load drives; with mu >= 1 the gear
-    is self-locking.
+    torque; on a rigid drive, whose inertia may be on either side, what gravity and other effects on the load take. The
+    efficiency is 1 / (1 + mu) while the motor drives, and 1 - mu while the load drives; with mu >= 1 the gear is
+    self-locking.
 
-    A rigid drive has no such effect, as the torque in its gear depends on how its inertia is divided between the sides.
     Reference: M. Duclusaud, G. Passault, V. Padois, O. Ly, Extended friction models for the physics simulation of servo
     actuators, arXiv:2410.08650 (2024): their load-dependent friction.
     """
 
     kind = "load_friction"
+    on_rigid = True
     coefficient: Scalar = size("", "friction torque over transmitted torque, mu", minimum=0.0)
 
     def gear_friction(self, state, torque):
