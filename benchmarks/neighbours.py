@@ -75,9 +75,10 @@ def _named(summary: dict[str, Any]) -> list[str]:
 
 
 def _answer(machine: Machine, logs: list[Path], holdout: Path | None) -> tuple[bool, str]:
-    """Whether all that is lacking is named and nothing else with more than 0.95, and what is named.
+    """Whether all that is lacking is named and nothing that is not there with more than 0.95, and what is named.
 
-    The truth's friction bends before it slides: where an encoder sees that, presliding is its name.
+    The truth's friction bends before it slides: where an encoder sees that, presliding is its name, and a model with
+    Coulomb friction lacks it.
     """
     import jaxbl
 
@@ -85,7 +86,8 @@ def _answer(machine: Machine, logs: list[Path], holdout: Path | None) -> tuple[b
     lacking = {name.replace("presliding", "coulomb") for name in machine.lacking}
     named = {finding["effect"].replace("presliding", "coulomb"): finding["confidence"] for finding in summary["findings"]}
     sure = {name for name, confidence in named.items() if confidence > 0.95}
-    return sure <= lacking <= set(named), f"{summary['verdict']}: {', '.join(_named(summary)) or 'nothing'}"
+    right = sure <= lacking | {"motor.coulomb_friction"} and lacking <= set(named)
+    return right, f"{summary['verdict']}: {', '.join(_named(summary)) or 'nothing'}"
 
 
 def try_contradiction(rng: np.random.Generator, folder: Path) -> tuple[bool, str]:
@@ -100,7 +102,7 @@ def try_contradiction(rng: np.random.Generator, folder: Path) -> tuple[bool, str
         for i, speed in enumerate(speeds)
     ]
     summary = jaxbl.diagnose(logs[:3], machine.model, holdout=logs[3]).summary
-    apart = [entry["path"] for entry in summary["contradictions"]]
+    apart = [entry["parameter"] for entry in summary["contradictions"]]
     return not apart, f"contradictions: {', '.join(apart) or 'none'}; {summary['verdict']}: {', '.join(_named(summary))}"
 
 

@@ -17,13 +17,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxbl.chain import Experiment
-from jaxbl.drive.effects import EFFECTS
+from jaxbl.drive.effects import EFFECTS, AbstractEffect
 from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.records.least_squares import column_rms
 from jaxbl.workers import announce
 
 from .blocks import standard_errors_better, standard_errors_between
-from .candidates import Candidate, EffectNumbers, are_possible, contains, replaces, variants_of
+from .candidates import Candidate, EffectNumbers, are_possible, contains, is_finer_law, replaces, variants_of
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
 from .free_functions import functions_of
@@ -250,7 +250,7 @@ class EffectSearch:
             accepted = [
                 (name, trial)
                 for name in rivals
-                for trial in (*rivals[name], *self._change_waves(current, name))
+                for trial in (*rivals[name], *self._try_laws(current, name))
                 if self.gain(current, trial.fitted).is_accepted
             ]
             name, best = max(accepted, key=lambda pair: -pair[1].gain.nats, default=("", None))
@@ -447,24 +447,27 @@ class EffectSearch:
             rivals.append(trial._replace(fitted=fitted, gain=gain))
         return rivals
 
-    def _change_waves(self, current: FittedModel, name: str) -> list[Trial]:
-        """Fit a model with the likeliest other waves of an effect, if it has any: a fit leaves whole numbers as they are."""
-        if not _waves(name):
-            return []
-        linear, predictor, variants = self._vary(current, [name])
-        variants = [
-            other
-            for other in variants
-            if any(getattr(other.effects[0], leaf) != current.numbers[name][leaf] for leaf in _waves(name))
+    def _try_laws(self, current: FittedModel, name: str) -> list[Trial]:
+        """Fit a model with the likeliest other waves of an effect, if it has any, as a fit leaves whole numbers as they are,
+        and with finer laws of a memory in its place: no screening along a predictor's path foresees how they change it."""
+        waves = {leaf: current.numbers[name][leaf] for leaf in _waves(name)}
+        finer = [law for law in self.lacking if law != name and is_finer_law(law) and replaces(law, name)]
+        laws = [law for law in finer if EFFECTS[law].advance is not AbstractEffect.advance]
+        linear, predictor, variants = self._vary(current, [name, *laws])
+        suitable = [
+            variant
+            for variant in variants
+            if variant.name != name or any(getattr(variant.effects[0], leaf) != count for leaf, count in waves.items())
         ]
-        ranked = self._rank(linear, current.names, variants, predictor, -np.inf)
-        if not ranked:
-            return []
-        numbers = {**current.numbers, **ranked[0].numbers}
-        fitted = self._refit(current, numbers, name)
-        gain = self.gain(fitted, current)
-        self._note(f"{name} with other waves", gain, False, "what is better by the same rule stays", loss=True)
-        return [Trial((name,), fitted, gain)]
+        trials = list[Trial]()
+        for proposal in self._rank(linear, current.names, suitable, predictor, -np.inf) if suitable else ():
+            (law,) = proposal.numbers
+            fitted = self._try(current, proposal).fitted
+            gain = self.gain(fitted, current)
+            change = f"{name} with other waves" if law == name else describe_change(current.numbers, fitted.numbers)
+            self._note(change, gain, False, "what is better by the same rule stays", loss=True)
+            trials.append(Trial((law,), fitted, gain))
+        return trials
 
     def _note(self, change: str, gain: Gain, accepted: bool, reason: str, *, loss: bool = False) -> None:
         nats, z = (-number if loss else number for number in gain[:2])

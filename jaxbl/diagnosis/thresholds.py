@@ -40,7 +40,9 @@ class Thresholds:
         default=0.5,
     )
     least_torque: float = parameter(
-        "driving torque", "of an effect that is named: twenty times the error of time stepping", default=1e-3
+        "driving torque",
+        "of an effect that is named: drives know their current, and so their torque, to half a percent at best",
+        default=5e-3,
     )
     slow_torque: float = parameter(
         "driving torque",

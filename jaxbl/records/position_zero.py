@@ -22,7 +22,7 @@ _CUTOFF = 50.0
 _MIN_ROWS = 10 * BLOCKS
 """Rows of a log in motion at least: some ten in each block."""
 _SURE_ERRORS = 6.0
-"""Standard errors from which on a wave is sure, one of eighty numbers exceeds them by chance in 1 log of 100, and a shift."""
+"""Standard errors from which on a wave or a shift is sure: one of eighty numbers exceeds them by chance in 1 log of 100."""
 _MOST_WAVES = 8
 """Waves that are sought: the largest of them are enough to tell a shift."""
 _SURE_SHIFT_ERRORS, _BETTER_ERRORS = 4.0, 3.0
