@@ -926,10 +926,8 @@ DIAGNOSIS = {
         "holdout_rmse_before": GAP,
         "holdout_rmse_after": {"theta_e": 0.001, "torque_motor": 0.01},
         "noise_floor": {"theta_e": 0.001, "torque_motor": 0.01},
-        "free_run": {},
         "expected": {"theta_e": {"limit": 0.0012}, "torque_motor": {"limit": 0.02}},
         "test": PASSED,
-        "controls": {},
     },
 }
 

@@ -125,7 +125,7 @@ def describe_finding(record: Record, finding: Finding, values: Numbers, errors: 
 
 
 def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
-    """Say what the held-out errors of a complete model would be, which of them are larger, and the control."""
+    """Say what the held-out errors of a complete model would be, and which of them are larger."""
     expected = proof.expected
     before, after = (proof.log.with_slow(comparison) for comparison in (proof.before, proof.after))
     return {
@@ -136,7 +136,6 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
             if " below " in name
         },
         "test": judgement.test,
-        "controls": proof.controls,
     }
 
 

@@ -257,9 +257,7 @@ def _summary(
             "holdout_rmse_after": {"theta_e": holdout["rms"]},
             "noise_floor": {"theta_e": noise},
             "units": {"theta_e": unit},
-            "free_run": {},
             "expected": {"theta_e": {"limit": limit}},
             "test": judgement.test,
-            "controls": {},
         },
     }  # fmt: skip

@@ -27,7 +27,7 @@ from .diagnosis_task import input_rms
 from .expected_errors import Expected, expected_errors, list_failed
 from .fitted_model import FittedModel
 from .neutral_effects import without
-from .reference_log import PREDICTABLE, Comparison, Errors, ReferenceLog
+from .reference_log import Comparison, Errors, ReferenceLog
 from .refit import ModelFits, owner_of
 from .setup import Setup, quiet
 from .thresholds import LIMITS
@@ -42,12 +42,10 @@ class Proof(NamedTuple):
         expected: errors of a complete model, by channel.
         failed: channels in which the model leaves more, but for the weak ones.
         worse: whether the model as given predicts better, all channels together.
-        controls: the best model with another effect in place of one of them, which must not do as well, as in
-            `diagnosis.json`.
         weak: channels that test nothing, since a complete model may leave more than the motion or the driving torque.
         untested: effects without which the model would pass as well: their torque there, and on the log that was fitted
             (`on_log`), N m, rms at the motor.
-        gap: errors before and after, noise, and the free run, as in `diagnosis.json`.
+        gap: errors before and after, and noise, as in `diagnosis.json`.
     """
 
     record: Record
@@ -57,7 +55,6 @@ class Proof(NamedTuple):
     expected: dict[str, Expected]
     failed: list[str]
     worse: bool
-    controls: JsonObject
     weak: list[str]
     untested: JsonObject
     gap: JsonObject
@@ -113,10 +110,9 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         # what tests nothing contradicts nothing
         [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
-        _compare_rival(chosen, log, after),
         weak,
         _find_untested(setup, chosen, log, expected),
-        _describe_gap(setup, chosen, record, log, before, after),
+        _describe_gap(setup, record, log, before, after),
     )  # fmt: skip
 
 
@@ -156,21 +152,11 @@ def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> 
     )
 
 
-def _compare_rival(chosen: Chosen, log: ReferenceLog, after: Comparison) -> JsonObject:
-    if chosen.rival is None:
-        return {}
-    other = log.compare(chosen.rival.fitted.experiment)
-    z = standard_errors_better(log, other, after)
-    return {"wrong": {"effect": chosen.rival.effect, "rmse": other.errors, "z": z}}
-
-
-def _describe_gap(
-    setup: Setup, chosen: Chosen, record: Record, log: ReferenceLog, before: Comparison, after: Comparison
-) -> JsonObject:
+def _describe_gap(setup: Setup, record: Record, log: ReferenceLog, before: Comparison, after: Comparison) -> JsonObject:
     """Errors before and after, and the noise."""
     noise = log.noise_of(after)
     reach, there = _reach(setup.fitted), _reach(log)
-    summary: JsonObject = {
+    return {
         "holdout": {
             "file": str(record.path.resolve()),
             "separate": setup.task.separate,
@@ -185,15 +171,7 @@ def _describe_gap(
         "holdout_rmse_after": after.errors,
         "noise_floor": {name: noise[name] for name in after.errors},
         "range": {name: {"log": reach[name], "proof": there[name]} for name in reach},
-        "free_run": {},
     }
-    for name, experiment in (("before", setup.nominal), ("after", chosen.fitted.experiment)):
-        errors, growth = log.free_run(experiment)
-        if not growth < PREDICTABLE:
-            summary["free_run"] = {"why_not": "small changes of the initial speed grow to the size of the motion"}
-            break
-        summary["free_run"][name] = errors
-    return summary
 
 
 _UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}

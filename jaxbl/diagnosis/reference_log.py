@@ -5,7 +5,7 @@ is foretold. Torques by the equations of motion at the smoothed motion, behind o
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,10 +14,8 @@ import numpy as np
 
 from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.drive.effects import ConstantTorque
-from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.segments import Segment, at_period, reading_noise, windows_of
 from jaxbl.estimation.smoother import smooth
-from jaxbl.estimation.trajectory import Windows
 from jaxbl.fused.single_plant import simulate_plants
 from jaxbl.records import POSITION_CHANNELS
 from jaxbl.records.least_squares import rms
@@ -34,8 +32,6 @@ WINDOW = 0.5
 """Length of the short windows, s: several periods of a drive's resonance, and too short to drift far."""
 _LEAST_IN_WINDOW = 20
 """Samples of a window at least: ten times the states that are fitted to it."""
-PREDICTABLE = 0.02
-"""Share of the motion that the initial speed's uncertainty may grow to where a free run is to say anything."""
 _SLOW = (2.0, 4.0, 8.0)
 """Factors between the bandwidth and those below which missing torques are looked at once more: noise of torques falls with
 the bandwidth to the power 2.5, so that slow ones show better there."""
@@ -43,8 +39,8 @@ _LEAST_VALUES = 8
 """Independent values of a slow torque on the log at least."""
 _BEFORE = 512
 """Samples before a window whose inputs its model may remember: several time constants of most lags."""
-_STATES, _STATES_OF_ONE_RUN = 8, 3
-"""Initial states tried for each window, and for a free run, which determines its own much better."""
+_STATES = 8
+"""Initial states tried for each window."""
 
 
 Errors = dict[str, float]
@@ -155,7 +151,10 @@ class ReferenceLog:
         free = 0.5 * abs(force) / float(experiment.plant.inertia("motor")) * (self.samples * self.period) ** 2
         experiment, _ = with_torques(experiment)
         windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.at_rest)[0])
-        simulated, departures = _run(experiment, windows, windows.start).position, {}
+        simulated, departures = (
+            simulate_plants(*lean(experiment, windows.start), np.asarray(windows.torque), np.asarray(windows.time)).position,
+            {},
+        )
         for side in experiment.sides:
             apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
             span = max(
@@ -248,21 +247,6 @@ class ReferenceLog:
         friction = np.concatenate(columns, axis=1)
         return friction[:2], np.rint(friction[2]) > 0
 
-    def free_run(self, experiment: Experiment) -> tuple[Errors, float]:
-        """Errors of one run over the longest segment, and what a standard deviation of the initial speed would do to it.
-
-        The latter over the motion's; large where a free run cannot be predicted. Up to a ninth at the end may be left out,
-        so that compiled programs serve logs of several lengths.
-        """
-        experiment, longest = at_period(experiment, self.period), max(map(len, self.segments))
-        spare = max(longest.bit_length() - 4, 0)
-        length = longest >> spare << spare
-        log = replace(self, segments=[next(part for part in self.segments if len(part) >= length)])
-        errors = _all_rms(log._samples(experiment, length, _STATES_OF_ONE_RUN)[0])
-        smoothed = log.segments[0].smoothed
-        deviation = {side: float(np.median(part.deviation(1))) for side, part in smoothed.items()}
-        return errors, log._growth(experiment, length, deviation)
-
     def _samples(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[NamedArrays, Errors]:
         """Errors of positions and speeds on windows of a length, where windows are foretold; shape (windows, samples). And
         what noise adds by way of the initial states, as of a comparison."""
@@ -287,19 +271,6 @@ class ReferenceLog:
         indices = _rows_of(len(firsts), part)
         return best_runs(experiment, windows, passes, self.at_rest, indices), firsts[indices]
 
-    def _growth(self, experiment: Experiment, length: int, deviation: Mapping[str, float]) -> float:
-        """Change of the positions by a standard deviation of the initial speeds, over the motion; the largest."""
-        experiment, _ = with_torques(experiment)
-        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, length, self.at_rest)[0])
-        start, step = windows.start, 1e-3
-        moved = {side: value + step * deviation[side] for side, value in start.velocity.items()}
-        starts = start, PlantState(start.position, moved, start.effects)
-        position, other = (_run(experiment, windows, state).position for state in starts)
-        # of what diverges, or of a side that never moved, nothing can be predicted
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            change = {side: _rms([np.asarray(other[side][0] - position[side][0])]) / step for side in experiment.sides}
-            return float(np.max([change[side] / np.std(windows.measured[side][0]) for side in experiment.sides]))
-
 
 def parts_of_blocks(parts: int) -> np.ndarray:
     """Tell to which of so many parts each block of a log belongs, shape (blocks,): 0 1 2 3, 1 2 3 0, 2 3 0 1, 3 0 1 2 of
@@ -311,11 +282,6 @@ def parts_of_blocks(parts: int) -> np.ndarray:
 def _rows_of(count: int, part: _Part) -> np.ndarray:
     """Find the rows of a part of a log, in order."""
     return np.flatnonzero(parts_of_blocks(part[1])[BLOCKS * np.arange(count) // count] == part[0])
-
-
-def _run(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
-    """States along each window."""
-    return simulate_plants(*lean(experiment, start), np.asarray(windows.torque), np.asarray(windows.time))
 
 
 def _all_rms(samples: NamedArrays) -> Errors:

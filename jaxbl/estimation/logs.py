@@ -103,7 +103,7 @@ class LogTask:
         return total.hexdigest()[:16]
 
 
-_SUMMARIES = 6
+_SUMMARIES = 7
 """Version of what `identification.json` and `diagnosis.json` hold: results of another one are computed anew."""
 _MOST_STEPS = 1000
 """Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""

@@ -112,7 +112,6 @@ def test_the_gap_shrinks_to_the_noise_on_what_was_held_out(diagnosis):
     assert before["theta_e"] > 20.0 * floor["theta_e"]
     assert after["theta_e"] < 1.5 * floor["theta_e"]
     assert after["torque_motor"] < 0.5 * before["torque_motor"]
-    assert gap["free_run"]["after"]["theta_e"] < 0.1 * gap["free_run"]["before"]["theta_e"]
 
 
 def test_what_is_held_out_keeps_its_times_and_is_not_fitted(logs, diagnosis):

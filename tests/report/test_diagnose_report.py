@@ -56,16 +56,12 @@ SUMMARY = {
         "holdout_rmse_before": ERRORS,
         "holdout_rmse_after": scale_errors(0.011),
         "noise_floor": scale_errors(0.01),
-        "free_run": {"before": ERRORS, "after": scale_errors(0.02)},
         "expected": {
             name: {"noise": 0.01 * value, "open": 0.0, "least": 0.0, "limit": 0.012 * value}
             for name, value in ERRORS.items()
             if not name.startswith("velocity")
         },
         "test": PASSED,
-        "controls": {
-            "wrong": {"effect": "load.stribeck_friction", "rmse": scale_errors(0.3), "z": 12.3},
-        },
     },
 }
 
