@@ -55,7 +55,8 @@ def test_torques_too_small_to_be_named_do_not_fail_a_model(tmp_path):
     errors, expected = compare_with_expected(
         tmp_path, simulate_multisine_log(), {"motor.coulomb_friction": {"torque": FRICTION["torque"]}}
     )
-    assert expected["torque_motor"].least == pytest.approx(0.5e-3)
+    # of the 0.5 N m that drive it
+    assert expected["torque_motor"].least == pytest.approx(0.5 * LIMITS.least_torque)
     more = errors | {"torque_motor": 1.05 * expected["torque_motor"].limit}
     assert list_failed(more, expected) == ["torque_motor"]
     assert list_failed(errors | {"theta_e": np.inf}, expected) == ["theta_e"]
