@@ -4,10 +4,10 @@ A round: effects are proposed by the prediction errors of the linearised model (
 missing torque (:mod:`.torque_regression`), there also several together. Each is put into the model, all numbers are fitted
 (:mod:`.refit`), and the two models are compared (:class:`Gain`). The best one that is accepted stays. Then whatever is there
 is asked for again: an effect stays if the model without it, or with its special case in its place, is worse by the same
-rule. In the end what was passed by is tried in the place of what is there: rivals, other waves, and effects where numbers
-were taken to be off. Then free functions of time, position and velocity are fitted to what remains: one that gains
-clearly says that something else is missing. What is less likely than something unknown in its place goes again
-(:mod:`.choice`).
+rule. In the end what was passed by is tried in the place of what is there: rivals, other waves, laws with a memory, and
+effects where numbers were taken to be off. Then free functions of time, position and velocity are fitted to what remains:
+one that gains clearly says that something else is missing. What is less likely than something unknown in its place goes
+again (:mod:`.choice`).
 """
 
 import dataclasses
