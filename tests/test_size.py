@@ -19,9 +19,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # shows. `drive` has a bound of what a flexible part is and, with `config`, friction under load of one inertia; `cli` and
 # `records` say first what a proposed model leaves open.
 CEILINGS = {
-    "all": (392055, 0.02, 0.2, 0.0),
+    "all": (392041, 0.02, 0.2, 0.0),
     "report": (45486, 0.04, 0.56, 0.0),
-    "diagnosis": (57848, 0.0, 0.0, 0.0),
+    "diagnosis": (57834, 0.0, 0.0, 0.0),
     "records": (53050, 0.0, 0.0, 0.0),
     "gains": (38771, 0.0, 0.0, 0.0),
     "estimation": (32273, 0.0, 0.0, 0.0),

@@ -151,10 +151,8 @@ class ReferenceLog:
         free = 0.5 * abs(force) / float(experiment.plant.inertia("motor")) * (self.samples * self.period) ** 2
         experiment, _ = with_torques(experiment)
         windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.at_rest)[0])
-        simulated, departures = (
-            simulate_plants(*lean(experiment, windows.start), np.asarray(windows.torque), np.asarray(windows.time)).position,
-            {},
-        )
+        simulated = simulate_plants(*lean(experiment, windows.start), windows.torque, windows.time).position
+        departures = {}
         for side in experiment.sides:
             apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
             span = max(
