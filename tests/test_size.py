@@ -19,9 +19,9 @@ from size import ROOT, Size, measure_file, measure_folders
 # shows. `drive` has a bound of what a flexible part is and, with `config`, friction under load of one inertia; `cli` and
 # `records` say first what a proposed model leaves open.
 CEILINGS = {
-    "all": (392041, 0.02, 0.2, 0.0),
+    "all": (392084, 0.02, 0.2, 0.0),
     "report": (45486, 0.04, 0.56, 0.0),
-    "diagnosis": (57834, 0.0, 0.0, 0.0),
+    "diagnosis": (57843, 0.0, 0.0, 0.0),
     "records": (53050, 0.0, 0.0, 0.0),
     "gains": (38771, 0.0, 0.0, 0.0),
     "estimation": (32273, 0.0, 0.0, 0.0),
@@ -29,10 +29,10 @@ CEILINGS = {
     "exports": (24343, 0.02, 0.0, 0.0),
     "fused": (25356, 0.0, 0.0, 0.0),
     ".": (23220, 0.0, 0.0, 0.0),
-    "drive": (13287, 0.0, 1.6, 0.0),
+    "drive": (13318, 0.0, 1.6, 0.0),
     "throughput": (10661, 0.0, 0.0, 0.0),
     "cli": (9756, 0.09, 0.0, 0.0),
-    "config": (10497, 0.0, 0.0, 0.0),
+    "config": (10500, 0.0, 0.0, 0.0),
     "observer": (9184, 0.0, 0.0, 0.0),
     "monitoring": (5877, 0.0, 0.0, 0.0),
     "control": (2496, 0.0, 0.0, 0.0),

@@ -226,7 +226,7 @@ def _check_effects(config: Config) -> None:
     for i, effect in enumerate(config.effects):
         place = effect.kind.partition(".")[0]
         twice = place == "load" and rigid and "motor" in EFFECTS[effect.kind].places
-        geared = config.transmission is not None or (rigid and EFFECTS[effect.kind].on_rigid)
+        geared = config.transmission is not None or (rigid and EFFECTS[effect.kind].suits(None))
         places = {*drive.bodies, "actuator", "encoder", *(("transmission",) if geared else ())}
         if twice or drive.resolve_place(place) not in places:
             raise table_error(

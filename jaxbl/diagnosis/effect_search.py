@@ -451,8 +451,10 @@ class EffectSearch:
         """Fit a model with the likeliest other waves of an effect, if it has any, as a fit leaves whole numbers as they are,
         and with finer laws of a memory in its place: no screening along a predictor's path foresees how they change it."""
         waves = {leaf: current.numbers[name][leaf] for leaf in _waves(name)}
-        finer = [law for law in self.lacking if law != name and is_finer_law(law) and replaces(law, name)]
-        laws = [law for law in finer if EFFECTS[law].advance is not AbstractEffect.advance]
+        with_memory = [law for law in self.lacking if EFFECTS[law].advance is not AbstractEffect.advance]
+        laws = [law for law in with_memory if law != name and is_finer_law(law) and replaces(law, name)]
+        if not (waves or laws):
+            return []
         linear, predictor, variants = self._vary(current, [name, *laws])
         suitable = [
             variant
@@ -460,7 +462,7 @@ class EffectSearch:
             if variant.name != name or any(getattr(variant.effects[0], leaf) != count for leaf, count in waves.items())
         ]
         trials = list[Trial]()
-        for proposal in self._rank(linear, current.names, suitable, predictor, -np.inf) if suitable else ():
+        for proposal in self._rank(linear, current.names, suitable, predictor, -np.inf):
             (law,) = proposal.numbers
             fitted = self._try(current, proposal).fitted
             gain = self.gain(fitted, current)

@@ -30,7 +30,7 @@ def candidates(experiment: Experiment) -> list[str]:
         place = name.partition(".")[0]
         # on a rigid drive the motor has all that both sides may have; only a load has the others
         twice = place == "load" and place not in experiment.sides and "motor" in cls.places
-        possible = cls.on_rigid or experiment.transmission is not None
+        possible = experiment.transmission is not None or cls.suits(None)
         if cls.neutral() and place in places and possible and name not in present and not twice:
             names.append(name)
     return names

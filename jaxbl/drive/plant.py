@@ -210,8 +210,8 @@ class Plant(eqx.Module):
     def load_torque(self, states: EffectStates, motion: Motion) -> Scalar:
         """Torque (N m) that gravity and other effects without a memory take on the load of a rigid drive."""
         pairs = zip(self.effects, states, strict=True)
-        carried = [(effect, state) for effect, state in pairs if effect.place == "load" and not effect.init()]
-        return sum((effect.resist(state, motion) for effect, state in carried), 0.0)
+        steady = [pair for pair in pairs if pair[0].place == "load" and type(pair[0]).advance is AbstractEffect.advance]
+        return sum((effect.resist(state, motion) for effect, state in steady), 0.0)
 
     def _elastic_motion(
         self, position: SideValues, velocity: SideValues, states: EffectStates

@@ -165,7 +165,6 @@ class AbstractEffect(eqx.Module):
         state_from_input: True if its state is the commanded input, whatever its numbers and the motion.
         state_from_measurement: True if its numbers and a log's input or measured motion determine its state.
         in_time: True if it depends on the time since a log began.
-        on_rigid: True if it has a meaning on a rigid drive.
         rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
         in_log: words that say how it is taken off a log, if it is an error of the recording: a diagnosis asks for it first.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
@@ -179,7 +178,6 @@ class AbstractEffect(eqx.Module):
     state_from_input = False
     state_from_measurement = False
     in_time = False
-    on_rigid = True
     rotary = False
     in_log = ""
     corrects: ClassVar[str | None] = None
@@ -338,7 +336,10 @@ class TransmissionEffect(AbstractEffect):
     """An effect in the gear."""
 
     places = ("transmission",)
-    on_rigid = False
+
+    @classmethod
+    def suits(cls, transmission):
+        return transmission is not None
 
 
 class ActuatorEffect(AbstractEffect):

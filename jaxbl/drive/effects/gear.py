@@ -50,7 +50,7 @@ class Backlash(TransmissionEffect):
     @classmethod
     def suits(cls, transmission):
         # the gap of a law and this one cannot be told apart
-        return "half_gap" not in transmission.truth()
+        return super().suits(transmission) and "half_gap" not in transmission.truth()
 
 
 @EFFECTS.add
@@ -133,8 +133,11 @@ class LoadFriction(TransmissionEffect):
     """
 
     kind = "load_friction"
-    on_rigid = True
     coefficient: Scalar = size("", "friction torque over transmitted torque, mu", minimum=0.0)
+
+    @classmethod
+    def suits(cls, transmission):
+        return True
 
     def gear_friction(self, state, torque):
         return self.coefficient * jnp.abs(torque)
