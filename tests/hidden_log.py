@@ -60,11 +60,11 @@ def simulate_multisine_log(
 
 
 def simulate_direct_drive(
-    torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed: int, inertia: float = 0.02
+    torque: np.ndarray, effects: list[dict[str, Any]], noise: float, seed: int, inertia: float = 0.02, speed: float = 0.0
 ) -> Log:
-    """Simulate the direct drive under a torque (N m, every 2 ms)."""
-    machine = Machine(DRIVE | {"motor_inertia": inertia}, None, effects)
-    (trace,) = simulate([Run(machine, 2e-3, torque, motor_noise=noise, seed=seed)])
+    """Simulate the direct drive under a torque (N m, every 2 ms), from a speed (rad/s)."""
+    machine, initial = Machine(DRIVE | {"motor_inertia": inertia}, None, effects), (0.0, speed, 0.0, 0.0)
+    (trace,) = simulate([Run(machine, 2e-3, torque, initial=initial, motor_noise=noise, seed=seed)])
     return Log(trace.t, trace.u, trace.theta_e, None)
 
 

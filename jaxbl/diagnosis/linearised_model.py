@@ -20,7 +20,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -273,9 +272,19 @@ class Predictor:
 
 @jit
 def _figures(experiment: Experiment) -> tuple[Any, dict[str, Any]]:
-    """Gain of the input, and inertia of each side, kg m^2: as one program."""
+    """Gain of the input, and inertia of each side over its ratio, kg m^2: as one program."""
     plant = experiment.plant
-    return plant.input_gain, {side: jnp.asarray(plant.inertia(side)) for side in experiment.sides}
+    return plant.input_gain, {side: plant.inertia(side) / experiment.drive.ratio(side) for side in experiment.sides}
+
+
+def find_driving_torque(experiment: Experiment, segments: Sequence[Segment]) -> tuple[float, bool]:
+    """Find the size of the torques along a log, N m rms at the motor: the input's; where there is none, what the motion
+    takes. And whether it is the input's."""
+    gain, inertia = _figures(experiment)
+    driving = float(gain) * rms(np.concatenate([segment.torque for segment in segments]))
+    taken = [float(inertia[side]) * segment.smoothed[side].acceleration for segment in segments for side in experiment.sides]
+    inertial = rms(np.concatenate(taken))
+    return (driving, True) if driving > _NO_INPUT * inertial else (inertial, False)
 
 
 class Linear:
@@ -306,24 +315,12 @@ class Linear:
         ]
         self.count = sum(int(signals.real.sum()) for signals in self.signals)
         self.states = self.parts[0].defect.shape[1]
-        gain, self._inertia = _figures(self.experiment)
-        self.input_gain = float(gain)
-        self.drive, self.driven = self._drive()
+        self.input_gain = float(_figures(self.experiment)[0])
+        self.drive, self.driven = find_driving_torque(self.experiment, segments)
         self._noise, self._scales = reading_noise(segments), dict[str, Scales]()
         # what the last search chose, and what the one without candidates did, which is asked for again and again
         self._last: tuple[Predictor, list[Forces]] | None = None
         self._alone: tuple[Predictor, list[Forces]] | None = None
-
-    def _drive(self) -> tuple[float, bool]:
-        """Size of the torques, N m rms at the motor: the input's; where there is none, what the motion takes. And which."""
-        driving = self.input_gain * rms(np.concatenate([signals.torque[signals.real] for signals in self.signals]))
-        taken = [
-            float(self._inertia[side]) / signals.over(side) * signals.part.acceleration[side][signals.real]
-            for signals in self.signals
-            for side in self.sides
-        ]
-        inertial = rms(np.concatenate(taken))
-        return (driving, True) if driving > _NO_INPUT * inertial else (inertial, False)
 
     def scales(self, name: str) -> Scales:
         """Measure how large things are on the record, as an effect sees them; frequencies are sought anew each time."""

@@ -23,9 +23,9 @@ from jaxbl.records.least_squares import rms
 from .blocks import standard_errors_better
 from .candidates import ZERO_SPREAD
 from .choice import Chosen
-from .diagnosis_task import input_rms
 from .expected_errors import Expected, expected_errors, list_failed
 from .fitted_model import FittedModel
+from .linearised_model import find_driving_torque
 from .neutral_effects import without
 from .reference_log import Comparison, Errors, ReferenceLog
 from .refit import ModelFits, owner_of
@@ -102,7 +102,8 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     fitted, nominal = chosen.fitted, setup.nominal
     before, after = log.compare(nominal), log.compare(fitted.experiment)
     expected = expected_errors(log, fitted, after, setup.input_noise, chosen.driving)
-    sizes = _sizes(log, fitted.experiment, input_rms(record))
+    driving, _ = find_driving_torque(fitted.experiment, log.segments)
+    sizes = _sizes(log, fitted.experiment, driving)
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
     return Proof(
@@ -112,7 +113,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
         weak,
         _find_untested(setup, chosen, log, expected),
-        _describe_gap(setup, record, log, before, after),
+        _describe_gap(setup, record, log, before, after, driving),
     )  # fmt: skip
 
 
@@ -128,7 +129,7 @@ def _reach(log: ReferenceLog) -> Errors:
 
 def _sizes(log: ReferenceLog, experiment: Experiment, driving: float) -> Errors:
     """Size of what is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives
-    it, N m, rms; `driving`: that of the input."""
+    it, N m, rms; `driving`: that at the motor."""
     sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
     return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
 
@@ -152,8 +153,10 @@ def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> 
     )
 
 
-def _describe_gap(setup: Setup, record: Record, log: ReferenceLog, before: Comparison, after: Comparison) -> JsonObject:
-    """Errors before and after, and the noise."""
+def _describe_gap(
+    setup: Setup, record: Record, log: ReferenceLog, before: Comparison, after: Comparison, driving: float
+) -> JsonObject:
+    """Errors before and after, the noise, and the torque that is `driving`."""
     noise = log.noise_of(after)
     reach, there = _reach(setup.fitted), _reach(log)
     return {
@@ -166,7 +169,7 @@ def _describe_gap(setup: Setup, record: Record, log: ReferenceLog, before: Compa
             "bandwidth": dict(log.bandwidth),
         },
         "units": {name: _unit(record, name) for name in after.errors},
-        "driving": {"motor": input_rms(record)},
+        "driving": {"motor": driving},
         "holdout_rmse_before": before.errors,
         "holdout_rmse_after": after.errors,
         "noise_floor": {name: noise[name] for name in after.errors},

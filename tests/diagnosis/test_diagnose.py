@@ -317,6 +317,18 @@ def test_a_proof_that_does_not_move_tests_nothing(logs):
     assert any("Hold out a log that reaches as far: motor position " in line for line in result.remarks)
 
 
+def test_a_drive_that_coasts_is_tested_by_its_torque(tmp_path):
+    """Without an input a torque is large or small beside what the motion takes: a friction that the log has not fails."""
+    for name, effects in (("plain", []), ("rubbing", [FRICTION])):
+        simulate_direct_drive(np.zeros(1000), effects, 3e-5, 1, speed=20.0).write(tmp_path / f"{name}.csv")
+    uncertainty = {"relative": 0.02, "exact": ["drive.motor_inertia"]}
+    model = nominal_study(log={"initial_state": "unknown", "absent": ["u"]}, uncertainty=uncertainty)
+    summary = diagnose(tmp_path / "plain.csv", model, holdout=tmp_path / "rubbing.csv").summary
+    assert summary["verdict"] == "unknown_effect"
+    test = summary["gap"]["test"]
+    assert "torque_motor" in test["failed"] and not any(name.startswith("torque") for name in test["weak"])
+
+
 def test_the_history_leads_from_log_to_name(diagnosis):
     """Each line says what was tried, what it gained, and why it was kept or dropped; what is kept is what is named."""
     history = diagnosis.summary["history"]
