@@ -7,7 +7,10 @@ gear with a gap. Each side takes the coarsest settings whose load position stays
 tolerance: plant steps a sample of jaxbl; the longest step (s) of jaxonomy, whose tolerances do not see an error of first
 order where the torque changes. Then: lines of user code (those of the functions `*_model`, `*_run` and `*_batch` below),
 time from the first line to the first result, and samples of drives with other gaps a second by each one's own batch call.
-jaxonomy is left out where it is not installed (`pip install jaxonomy`, beside jaxbl).
+jaxonomy is left out where it is not installed. jaxonomy 3.4 asks for jax < 0.10 and jaxbl for jax >= 0.10.2, so that pip
+refuses the pair, and `jaxbl bench` has no row for it; it runs with the newer one all the same:
+
+    printf 'jax>=0.10.2\njaxlib>=0.10.2\n' > newer.txt && uv pip install --override newer.txt "jaxonomy>=3.4" -e .
 """
 
 import argparse

@@ -312,15 +312,23 @@ def find_missed(measured: TracedArrays, torque: Number) -> TracedArrays:
     return {side: ~jnp.isfinite(reading + torque) for side, reading in measured.items()}
 
 
-def move_plant(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
-    """Move the plant from one sample (at `time`, s) to the next, in `run.substeps` steps under a held `torque` (N m)."""
+def begin_sample(
+    plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number
+) -> tuple[PlantState, Callable[[Int[Array, ""], PlantState], PlantState]]:
+    """The state with the `torque` (N m) that arrives at a sample (at `time`, s) and is held until the next one, and the
+    plant's step from there, by its number."""
     period = run.sample_period / run.substeps
     effects, arriving_torque = plant.receive(state.effects, torque, run.sample_period)
-    state = PlantState(state.position, state.velocity, effects)
 
     def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
         return plant.advance(state, arriving_torque(i * period, period), time + i * period, period)
 
+    return PlantState(state.position, state.velocity, effects), substep
+
+
+def move_plant(plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number) -> PlantState:
+    """Move the plant from one sample to the next, in `run.substeps` steps; arguments as of :func:`begin_sample`."""
+    state, substep = begin_sample(plant, run, state, torque, time)
     if run.substeps == 1:
         return substep(jnp.asarray(0), state)
     return jax.lax.fori_loop(0, run.substeps, substep, state, unroll=UNROLL_SUBSTEPS)

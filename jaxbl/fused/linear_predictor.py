@@ -70,7 +70,9 @@ class LinearPredictor:
             # positions first, then velocities
             ordered = [np.asarray(number, float) for number in np.ravel(np.transpose(gain))]
             if self.loop is None:
-                _predict_slowly(carry, ordered, transition, padded_forcing, padded_readings, errors)
+                sample, columns = _sample_function(self.states, self.sides), (padded_forcing, padded_readings)
+                for i, step in enumerate(transition.reshape(count, -1)):
+                    carry[:], errors[:, i] = sample([*carry.copy()], ordered, [*step], *([*rows[:, i]] for rows in columns))
             else:
                 from .llvm import ArrayRows
 
@@ -108,20 +110,3 @@ def _compile_loop(states: int, sides: int) -> Any:
     examples = [[_NUMBER] * size for size in (states, 2 * sides, states * states, states, sides)]
     options = {"carry": states, "constants": 2 * sides, "lane_inputs": states + sides}
     return _sample_function(states, sides), examples, options
-
-
-def _predict_slowly(
-    change: np.ndarray,
-    gains: Sequence[Any],
-    transition: np.ndarray,
-    forcing: np.ndarray,
-    readings: np.ndarray,
-    errors: np.ndarray,
-) -> None:
-    """The recursion in Python; like the loop, it overwrites the change and the errors."""
-    sample = _sample_function(len(change), len(readings))
-    for i in range(len(transition)):
-        new, errors[:, i] = sample(
-            list(change.copy()), list(gains), list(transition[i].ravel()), list(forcing[:, i]), list(readings[:, i])
-        )
-        change[:] = new
