@@ -200,7 +200,10 @@ BAD = {
         rigid_study(effects=[{"kind": "transmission.damping", "damping": 1.0}]),
         "effects[0]: transmission.damping has no meaning on a rigid drive",
     ),
-    "rigid with load effect": (rigid_study(effects=[TABLES["load.inertia"]]), "effects[0]: load.inertia has no meaning"),
+    "rigid with load effect": (
+        rigid_study(effects=[TABLES["load.inertia"]]),
+        "effects[0]: load.inertia has no meaning on a rigid drive; it should be 'motor.inertia'",
+    ),
     "no transmission": (small_study({"transmission": None}), "[transmission] is missing"),
     "no load observer": (small_study({"observer.load": None}), "observer.load is missing"),
     "exact path": (small_study({"uncertainty.exact": ["drive.gear_rati"]}), "nearest valid path: 'drive.gear_ratio'"),

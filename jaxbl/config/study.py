@@ -224,16 +224,15 @@ def _check_effects(config: Config) -> None:
     drive = config.drive.build()
     rigid = "load" not in drive.bodies
     for i, effect in enumerate(config.effects):
-        place = effect.kind.partition(".")[0]
-        twice = place == "load" and rigid and "motor" in EFFECTS[effect.kind].places
-        geared = config.transmission is not None or (rigid and EFFECTS[effect.kind].suits(None))
+        cls, place = EFFECTS[effect.kind], effect.kind.partition(".")[0]
+        twice = place == "load" and rigid and "motor" in cls.places
+        geared = config.transmission is not None or (rigid and cls.suits(None))
         places = {*drive.bodies, "actuator", "encoder", *(("transmission",) if geared else ())}
         if twice or drive.resolve_place(place) not in places:
-            raise table_error(
-                f"effects[{i}]: {effect.kind} has no meaning on a {config.drive.kind} drive; motor.* and actuator.* effects "
-                "act on it"
-            )
-        if fault := EFFECTS[effect.kind].find_fault(effect.model_dump(), config.run.sample_period):
+            same = f"it should be '{effect.kind.replace('load', 'motor')}'"
+            remedy = same if twice else "remove it, or use drive.kind = 'two_inertia'"
+            raise table_error(f"effects[{i}]: {effect.kind} has no meaning on a {config.drive.kind} drive; {remedy}")
+        if fault := cls.find_fault(effect.model_dump(), config.run.sample_period):
             raise table_error(f"effects[{i}]: {effect.kind}: {fault}")
     for side in drive.bodies:
         nominal = drive.inertia(side)
