@@ -236,7 +236,7 @@ def _check_effects(config: Config) -> None:
             raise table_error(f"effects[{i}]: {effect.kind}: {fault}")
     for side in drive.bodies:
         nominal = drive.inertia(side)
-        heavier = [effect for effect in config.effects if effect.kind.partition(".")[0] == side]
+        heavier = [effect for effect in config.effects if effect.kind.startswith(f"{side}.")]
         added = [float(effect.build().added_inertia()) for effect in heavier]
         if (total := nominal + sum(added)) <= 0.0:
             kind = next(effect.kind for effect, inertia in zip(heavier, added, strict=True) if inertia < 0.0)
