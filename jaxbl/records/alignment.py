@@ -4,13 +4,14 @@ A skew or an offset is sure if neither friction, gap nor load torque can cause i
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from .gearing import Gearing
-from .least_squares import fit_with_jackknife, residual_mean_square, rms
+from .gearing import Flanks, Gearing, find_flank
+from .least_squares import fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
     find_bandwidth,
@@ -26,8 +27,8 @@ _SURE_ERRORS = 6.0
 """Standard errors from which on an estimate is sure: errors from 12 blocks are themselves known to 20 %."""
 _NOMINAL_FACTOR = 3.0
 """Factor by which a stiffness, friction or gap of a data sheet may be wrong."""
-_MIN_HARMONIC_RESIDUAL = 0.5
-"""Share of the residual mean square that remains with harmonics of one to three periods a turn, if the log has none."""
+_MIN_HARMONIC_RESIDUAL = 0.5**0.5
+"""Share of the residual rms that remains with harmonics of one to three periods a turn, if the log has none."""
 _MIN_TORQUE_SHARE = 0.1
 """Share of the input torque that an offset has to cause in the nominal shaft, to be reported."""
 
@@ -114,7 +115,7 @@ def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Ske
     value, regression = gearing.skew, _regress_twist(grid, nominal, gearing.skew) if is_sure else None
     if regression is not None:
         # without the wind-up by the shaft torque, from the motor's equation of motion
-        value += float(regression.values[2]) / nominal.gear_ratio
+        value += float(regression.values[1]) / nominal.gear_ratio
     # friction takes something between nothing and all of it
     value = float(np.clip(value, gearing.skew - max_delay, gearing.skew))
     return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay, is_sure)
@@ -139,7 +140,8 @@ def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     regression = _regress_twist(grid, nominal)
     if regression is None:
         return None
-    values, errors, torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration = regression[:7]
+    values, errors = regression.values, regression.errors
+    torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration = regression.motion
     value = float(values[0])
     terms = [np.ones(len(torque)), motor_velocity, motor_acceleration, np.sign(motor_velocity)]
     bias, bias_error = (float(x[0]) for x in fit_with_jackknife(torque, np.column_stack(terms)))
@@ -168,24 +170,20 @@ def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
 
 
 class _Regression(NamedTuple):
-    """Regression of the twist, less the nominal wind-up, on 1, flank, load velocity and acceleration.
+    """Regression of the twist, less the nominal wind-up, on 1, load velocity and acceleration, and flank if there are both.
 
     Errors that repeat with the load's turn are regressed along if they improve the fit much.
 
     Attributes:
-        values, errors: coefficients of 1, flank, velocity, acceleration; 0 for the flank if there is only one.
-        torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration: low-passed, shape (samples,).
+        values, errors: coefficients of 1, velocity, acceleration and others.
+        motion: torque, velocity and acceleration of the load and of the motor, low-passed, shape (samples,) each.
         has_both_flanks: True if torque, velocity or acceleration of both signs occur.
         twist_range: of the twist without the wind-up, without a hundredth at each end, rad (m).
     """
 
     values: np.ndarray
     errors: np.ndarray
-    torque: np.ndarray
-    load_velocity: np.ndarray
-    load_acceleration: np.ndarray
-    motor_velocity: np.ndarray
-    motor_acceleration: np.ndarray
+    motion: Sequence[np.ndarray]
     has_both_flanks: bool
     twist_range: float
 
@@ -201,39 +199,33 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     for s in segments:
         moved = interpolate_spline(grid.time[s], load[s], grid.time[s] + skew) if skew else load[s]
         motor_motion, load_motion = (low_pass_motion(x, cutoff, grid.period) for x in (motor[s], moved))
-        torque = low_pass(grid.values["u"][s], cutoff, grid.period)
-        inner = trim_filter_ends(len(torque), cutoff, grid.period)
-        parts.append(np.stack([torque, *motor_motion, *load_motion], axis=1)[inner])
-    torque, motor_place, motor_velocity, motor_acceleration, place, velocity, acceleration = np.concatenate(parts).T
+        signals = np.stack([low_pass(grid.values["u"][s], cutoff, grid.period), *motor_motion, *load_motion])
+        parts.append(signals[:, trim_filter_ends(len(moved), cutoff, grid.period)])
+    torque, motor_place, motor_velocity, motor_acceleration, place, velocity, acceleration = np.concatenate(parts, axis=1)
     twist = motor_place - nominal.gear_ratio * place
     shaft_torque = torque - nominal.motor_inertia * motor_acceleration - nominal.motor_viscous * motor_velocity
     target = twist - shaft_torque / nominal.stiffness
-    constant = np.ones(len(target))
-    best = None
-    for flank in (shaft_torque, velocity, acceleration):
-        is_clear = np.abs(flank) > 0.3 * rms(flank)
-        share = float(np.mean(flank[is_clear] > 0.0)) if is_clear.any() else 0.0
-        if is_clear.sum() < 0.25 * len(is_clear) or not 0.05 < share < 0.95:
-            continue
-        rows = np.column_stack([constant, np.sign(flank), velocity, acceleration])[is_clear]
-        mean_square = residual_mean_square(target[is_clear], rows)
-        if best is None or mean_square < best[0]:
-            best = (mean_square, is_clear, rows)
-    flanks = best is not None
-    if best is None:
-        rows = np.column_stack([constant, velocity, acceleration])
-        best = (residual_mean_square(target, rows), constant > 0.0, rows)
-    mean_square, is_clear, rows = best
+    twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
+    terms = np.column_stack([np.ones(len(target)), velocity, acceleration])
+
+    def list_flanks() -> Flanks:
+        for flank in (shaft_torque, velocity, acceleration):
+            is_clear = np.abs(flank) > 0.3 * rms(flank)
+            share = np.mean(flank[is_clear] > 0.0) if is_clear.any() else 0.0
+            if is_clear.sum() >= 0.25 * len(is_clear) and 0.05 < share < 0.95:
+                yield np.sign(flank), is_clear
+
+    best = find_flank(target, terms, list_flanks())
+    rows = terms
+    if best is not None:
+        flank, is_clear = best
+        target, rows, place = target[is_clear], np.column_stack([terms, flank])[is_clear], place[is_clear]
     # over a part of a turn the eccentricity of an encoder or wheel has a mean, too
-    harmonics = [wave(n * place[is_clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]
-    with_harmonics = np.column_stack([rows, *harmonics])
-    if residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
+    with_harmonics = np.column_stack([rows, *(wave(n * place) for n in (1, 2, 3) for wave in (np.sin, np.cos))])
+    if rms(fit_residual(target, with_harmonics)) < _MIN_HARMONIC_RESIDUAL * rms(fit_residual(target, rows)):
         rows = with_harmonics
-    values, errors = fit_with_jackknife(target[is_clear], rows)
+    values, errors = fit_with_jackknife(target, rows)
     if not np.isfinite(values).all():
         return None
-    if not flanks:
-        values, errors = np.insert(values, 1, 0.0), np.insert(errors, 1, 0.0)
-    twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
     motion = torque, velocity, acceleration, motor_velocity, motor_acceleration
-    return _Regression(values, errors, *motion, flanks, twist_range)
+    return _Regression(values, errors, motion, best is not None, twist_range)

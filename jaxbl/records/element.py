@@ -24,8 +24,8 @@ import numpy as np
 from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
-from .least_squares import BLOCKS, BlockRegression, column_rms, fit_with_jackknife, rms
-from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass
+from .least_squares import BlockRegression, column_rms, fit_residual, fit_with_jackknife, rms, student_interval
+from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass, slices_between
 
 _MAX_SAMPLES = 20_000
 """Samples that are fitted; of longer logs, means. A few hundred describe a loop of torque over displacement."""
@@ -136,8 +136,7 @@ class _Rig:
         rate: slope of the low-passed displacement, shape (samples,).
         blur: displacement within a sample, and by noise, rad (m), shape (samples,).
         direction: of motion, +1 or -1, shape (samples,).
-        stretches: samples between reversals, in order, of all segments.
-        begins: for each stretch, True if it is the first one of its segment.
+        stretches: samples between reversals, in order, of all segments, each with True if it is the first of its segment.
         rows: samples that are fitted, after the first reversals of their segment.
         torque: N m (N), shape (samples,).
     """
@@ -146,14 +145,13 @@ class _Rig:
     rate: np.ndarray
     blur: np.ndarray
     direction: np.ndarray
-    stretches: list[slice]
-    begins: list[bool]
+    stretches: list[tuple[slice, bool]]
     rows: np.ndarray
     torque: np.ndarray
 
     @property
     def half_range(self) -> float:
-        return 0.5 * (float(self.position.max()) - float(self.position.min()))
+        return 0.5 * float(np.ptp(self.position))
 
     @property
     def fitted_torque(self) -> np.ndarray:
@@ -191,7 +189,7 @@ class _Rig:
     def _drag(self, reach: float) -> np.ndarray:
         """Return where the position has dragged what follows it at a distance of at most `reach`, shape (samples,)."""
         dragged, last = np.zeros(len(self.position)), 0.0
-        for part, begins in zip(self.stretches, self.begins, strict=True):
+        for part, begins in self.stretches:
             forward = float(self.direction[part.start])
             # how it was wound up before is unknown: not at all errs least
             last = self.position[part.start] if begins else last
@@ -203,12 +201,11 @@ class _Rig:
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
         h, last = np.zeros(len(deflection)), 0.0
-        for part, begins in zip(self.stretches, self.begins, strict=True):
+        for part, begins in self.stretches:
             forward = float(self.direction[part.start])
-            start = 0.0 if begins else last
-            before = deflection[part.start] if begins else deflection[part.start - 1]
+            before = deflection[part.start - (not begins)]
             way = np.maximum(forward * (deflection[part] - before), 0.0) / length
-            w = forward * start
+            w = 0.0 if begins else forward * last
             rise = np.tanh(np.maximum(way + min(w, 0.0), 0.0))
             base = max(w, 0.0)
             h[part] = forward * np.where(w + way < 0.0, w + way, (base + rise) / (1.0 + base * rise))
@@ -244,26 +241,22 @@ def _average_samples(log: RigLog) -> RigLog:
     count = min(math.ceil(len(position) / _MAX_SAMPLES), int(1.0 / (_SAMPLES_PER_PERIOD * width * period)))
     if count < 2:
         return log
-    parts, ends, mean_count = [], [], 0
+    parts = []
     for s in segments:
-        segment_means = (s.stop - s.start) // count
-        if segment_means < _MIN_MEANS:
-            continue
-        samples = np.stack([position[s], torque[s]])[:, : segment_means * count]
-        parts.append(samples.reshape(2, segment_means, count).mean(axis=2))
-        ends.append(slice(mean_count, mean_count + segment_means))
-        mean_count += segment_means
-    means = np.concatenate(parts, axis=1)
-    return RigLog(means[0], means[1], ends, count * period, noise / math.sqrt(count))
+        mean_count = (s.stop - s.start) // count
+        if mean_count >= _MIN_MEANS:
+            samples = np.stack([position[s], torque[s]])[:, : mean_count * count]
+            parts.append(samples.reshape(2, mean_count, count).mean(axis=2))
+    ends = itertools.accumulate((part.shape[1] for part in parts), initial=0)
+    return RigLog(*np.concatenate(parts, axis=1), slices_between(ends), count * period, noise / math.sqrt(count))
 
 
 def _prepare_rig(log: RigLog) -> _Rig | None:
     position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
     smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
-    stretches: list[slice] = []
-    begins: list[bool] = []
-    fitted_rows = []
+    stretches: list[tuple[slice, bool]] = []
+    fitted_rows = [np.arange(0)]
     # noise within the band of the motion stays
     share = math.sqrt(min(2.0 * _CUTOFF_RATIO * width * period, 1.0)) if width else 1.0
     for s in segments:
@@ -271,22 +264,20 @@ def _prepare_rig(log: RigLog) -> _Rig | None:
             smooth[s] = low_pass(position[s], _CUTOFF_RATIO * width, period)
         rate[s] = np.gradient(smooth[s], period)
         turns = _find_reversals(smooth[s], max(_REVERSAL_NOISE * noise * share, 1e-6 * float(np.ptp(position))))
-        ends = [0, *(index + 1 for index in turns), s.stop - s.start]
-        parts = [slice(s.start + a, s.start + b) for a, b in itertools.pairwise(ends) if b > a]
-        for i, part in enumerate(parts):
+        parts = slices_between([s.start, *(s.start + index + 1 for index in turns), s.stop])
+        for part in parts:
             travel = smooth[part.stop - 1] - smooth[max(part.start - 1, s.start)]
             direction[part] = 1.0 if travel >= 0.0 else -1.0
-            stretches.append(part)
-            begins.append(i == 0)
+            stretches.append((part, part.start == s.start))
         # the state of friction is unknown before a complete stretch, direction and rate at reversals
         guard = max(round(0.5 / (_CUTOFF_RATIO * width * period)) if width else 0, 2)
         settled_parts = parts[2:] if len(parts) > 3 else parts[1:]
         fitted_rows += [np.arange(part.start + guard, part.stop - guard) for part in settled_parts]
-    rows = np.concatenate([*fitted_rows, np.arange(0)])
+    rows = np.concatenate(fitted_rows)
     if len(rows) < MIN_SAMPLES or np.ptp(torque[rows]) == 0.0 or np.ptp(smooth[rows]) == 0.0:
         return None
     blur = np.abs(rate) * period + 4.0 * noise + 1e-9 * float(np.ptp(smooth))
-    return _Rig(position, rate, blur, direction, stretches, begins, rows, torque)
+    return _Rig(position, rate, blur, direction, stretches, rows, torque)
 
 
 def _find_reversals(values: np.ndarray, least: float) -> list[int]:
@@ -329,15 +320,13 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
             for term in TERMS
             if term not in best.terms
         ]
-        candidates = [
-            (model, gain) for model in models if model.is_possible and (gain := _compute_gain(rig, best, model)) is not None
-        ]
+        gains = [(_compute_gain(rig, best, model) if model.is_possible else None, model) for model in models]
+        candidates = [(len(model.shapes), -gain, model) for gain, model in gains if gain is not None]
         if not candidates:
             return best
         # of two that are equally good, the one with fewer numbers
-        candidates.sort(key=lambda candidate: (len(candidate[0].shapes), -candidate[1]))
-        best = candidates[0][0]
-        for model, _ in candidates[1:]:
+        (*_, best), *further = sorted(candidates, key=lambda candidate: candidate[:2])
+        for *_, model in further:
             if _compute_gain(rig, best, model) is not None:
                 best = model
 
@@ -345,21 +334,18 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
 def _drop_terms(rig: _Rig, model: _Model) -> _Model:
     """Drop terms that do not lower the error clearly, those with the smallest gain first."""
     while True:
-        reduced_models = [_fit_without(rig, model, term) for term in model.terms]
         sufficient_models = [
-            reduced_model
-            for reduced_model in reduced_models
-            if reduced_model.sizes[0] > 0.0 and _compute_gain(rig, reduced_model, model) is None
+            reduced
+            for term in model.terms
+            if (reduced := _fit_without(rig, model, term)).sizes[0] > 0.0 and _compute_gain(rig, reduced, model) is None
         ]
         if not sufficient_models:
             return model
-        model = min(sufficient_models, key=lambda reduced_model: float(np.mean(_held_out_errors(rig, reduced_model))))
+        model = min(sufficient_models, key=lambda reduced: np.mean(_held_out_errors(rig, reduced)))
 
 
 def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
-    return _drop_negative_terms(
-        rig, _fit_model(rig, tuple(kept_term for kept_term in model.terms if kept_term != term), model)
-    )
+    return _drop_negative_terms(rig, _fit_model(rig, tuple(kept for kept in model.terms if kept != term), model))
 
 
 def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model:
@@ -379,11 +365,6 @@ def _shape_names(terms: Sequence[str]) -> list[str]:
     return [name for name in names if name != "centre" or "slip" not in terms]
 
 
-def _fit_sizes(columns: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    scale = column_rms(columns) + 1e-300
-    return np.linalg.lstsq(columns / scale, torque, rcond=1e-10)[0] / scale
-
-
 def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) -> _Model:
     """Fit a model by least squares. The search starts at the shapes of `near`; other shapes start at the best of a grid."""
     from scipy.optimize import least_squares
@@ -399,8 +380,7 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     }
 
     def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
-        columns = rig.compute_columns(terms, shapes)
-        return rig.fitted_torque - columns @ _fit_sizes(columns, rig.fitted_torque)
+        return fit_residual(rig.fitted_torque, rig.compute_columns(terms, shapes))
 
     shapes = np.empty(0)
     if names:
@@ -413,7 +393,9 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
         solutions = [search(np.clip(np.array(start), *inside), args=(few,)) for start in starts]
         best = min(solutions, key=lambda solution: solution.cost)
         shapes = search(best.x, args=(rig,)).x
-    return _Model(terms, shapes, _fit_sizes(rig.compute_columns(terms, shapes), rig.fitted_torque))
+    columns = rig.compute_columns(terms, shapes)
+    scale = column_rms(columns) + 1e-300
+    return _Model(terms, shapes, np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale)
 
 
 def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
@@ -436,8 +418,6 @@ def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
 
 def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, float], linear: bool) -> Element:
     """Compute the numbers, with errors by a jackknife over blocks: these hold for errors of any correlation in time."""
-    from scipy.special import stdtrit
-
     names = [
         "stiffness",
         "offset",
@@ -460,14 +440,13 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         jacobian[:, place] /= stiffness
         values[place] *= stiffness
     _, errors = fit_with_jackknife(residual + jacobian @ values, jacobian)
-    quantile = float(stdtrit(BLOCKS - 1, 0.975))
     numbers, open_ = {}, []
     for name, value, error in zip(names, values.tolist(), errors.tolist(), strict=True):
         if name == "friction_coefficient":
             # fitted as its product with the stiffness
             error = math.hypot(error / model.sizes[0], value * errors[0] / model.sizes[0] ** 2)
             value = value / float(model.sizes[0])
-        low, high = value - quantile * error, value + quantile * error
+        low, high = student_interval(value, error)
         if name not in ("offset", "centre"):
             low = max(low, 0.0)
             if not error < _MAX_RELATIVE_ERROR * abs(value):
@@ -476,7 +455,7 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         numbers[name] = Quantity(value, error, (low, high), unit)
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_torque(model)
-    reversals = len(rig.stretches) - sum(rig.begins)
+    reversals = sum(not begins for _, begins in rig.stretches)
     return Element(
         numbers, tuple(open_), gains, model.terms, torque, *rig.compute_error(model), reversals, model.shapes, model.sizes
     )

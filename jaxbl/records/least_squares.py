@@ -26,11 +26,6 @@ def column_rms(columns: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(columns**2, axis=0))
 
 
-def scale_columns(columns: np.ndarray) -> np.ndarray:
-    """Divide each column by its largest magnitude, so that least squares are well conditioned."""
-    return columns / (np.abs(columns).max(axis=0) + 1e-300)
-
-
 @dataclass(frozen=True)
 class BlockRegression:
     """Least squares of a target on columns, by products over blocks of consecutive rows.
@@ -121,7 +116,16 @@ def jackknife_variance(without: np.ndarray | Sequence[float]) -> np.ndarray:
     return (len(deviations) - 1) / len(deviations) * np.sum(deviations**2, axis=0)
 
 
-def residual_mean_square(target: np.ndarray, regressors: np.ndarray) -> float:
-    """Return the mean square that a fit of regressors, shape (samples, terms), leaves."""
-    scaled = scale_columns(regressors)
-    return float(np.mean((target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]) ** 2))
+def fit_residual(target: np.ndarray, regressors: np.ndarray) -> np.ndarray:
+    """Return what a fit of regressors, shape (samples, terms), leaves of a target, or of several in columns."""
+    # so that least squares are well conditioned
+    scaled = regressors / (np.abs(regressors).max(axis=0) + 1e-300)
+    return target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]
+
+
+def student_interval(value: float, error: float, freedom: int = BLOCKS - 1) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of an estimate whose standard error has so many degrees of freedom."""
+    from scipy.special import stdtrit
+
+    reach = float(stdtrit(max(freedom, 1), 0.975)) * error
+    return value - reach, value + reach

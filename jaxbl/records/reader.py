@@ -254,7 +254,7 @@ def _resample_and_align(
         grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or len(encoders) < 2:
             return grid, None
-        turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
+        turn = math.inf if channels["theta_s"].unit == "m" else 2.0 * math.pi
         return grid, fit_gearing(grid.first(share), expected=gear_ratio, turn=turn)
 
     grid, gearing = resample()

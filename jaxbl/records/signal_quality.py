@@ -1,6 +1,7 @@
 """Quality of sampled signals: resolution, noise, bandwidth, saturation, jumps."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -186,6 +187,11 @@ def interpolate_spline(times: np.ndarray, values: np.ndarray, new_times: np.ndar
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(times, values)(np.clip(new_times, times[0], times[-1]))
+
+
+def slices_between(edges: Iterable[int]) -> list[slice]:
+    """Return the slices from each edge to the next."""
+    return [slice(start, stop) for start, stop in itertools.pairwise(edges)]
 
 
 def segments_before(segments: Sequence[slice], end: int) -> list[slice]:
