@@ -248,7 +248,8 @@ def _average_samples(log: RigLog) -> RigLog:
             samples = np.stack([position[s], torque[s]])[:, : mean_count * count]
             parts.append(samples.reshape(2, mean_count, count).mean(axis=2))
     ends = itertools.accumulate((part.shape[1] for part in parts), initial=0)
-    return RigLog(*np.concatenate(parts, axis=1), slices_between(ends), count * period, noise / math.sqrt(count))
+    position, torque = np.concatenate(parts, axis=1)
+    return RigLog(position, torque, slices_between(ends), count * period, noise / math.sqrt(count))
 
 
 def _prepare_rig(log: RigLog) -> _Rig | None:

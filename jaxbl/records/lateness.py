@@ -96,7 +96,7 @@ def _fit_lateness(
         reach = math.ceil(0.5 / (cutoff * period))
         is_inner = np.zeros(len(snap), bool)
         is_inner[trim_filter_ends(len(snap), cutoff, period)] = True
-        moving_rows.append(is_inner & ~maximum_filter1d(is_slow, 2 * reach + 1, mode="constant"))
+        moving_rows.append(is_inner & ~np.asarray(maximum_filter1d(is_slow, 2 * reach + 1, mode="constant"), bool))
         torques.append(low_pass(grid.values["u"][segment], cutoff, period))
     motion, rows = np.concatenate(columns), np.concatenate(moving_rows)
     if rows.sum() < 3 * MIN_SAMPLES:

@@ -149,7 +149,7 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
         torque, candidates = (part - basis @ (basis.T @ part) for part in (rows.torque, rows.waves[:, lowest:]))
         pairs = [np.linalg.qr(np.column_stack([wave.real, wave.imag]))[0] for wave in candidates.T]
         wave = lowest + int(np.argmax([np.sum((pair.T @ torque) ** 2) for pair in pairs]))
-        columns = np.column_stack([columns, rows.waves[:, wave].real, rows.waves[:, wave].imag])
+        columns = np.column_stack([columns, np.real(rows.waves[:, wave]), np.imag(rows.waves[:, wave])])
         coefficients, errors = fit_with_jackknife(rows.torque, columns)
         if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_ERRORS:
             break
