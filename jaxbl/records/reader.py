@@ -261,8 +261,7 @@ def _resample_and_align(
     lateness = None
     if "u" in channels and table.kind == "drive":
         lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
-        keys = None if lateness is None else _find_torque_keys(file, table, lateness, nominal, segmented.period)
-        if lateness is not None and keys is not None:
+        if lateness is not None and (keys := _find_torque_keys(file, table, lateness, nominal, segmented.period)):
             hold, skew = keys
             channels = {**channels, "u": channels["u"]._replace(hold=hold)}
             delays["u"] = Delay(skew)
@@ -271,10 +270,10 @@ def _resample_and_align(
             lateness = lateness._replace(value=lateness.value - late)
             grid, gearing = resample()
     is_estimated = any(raw.skew == "estimate" for raw in channels.values())
-    may_correct = shaft is not None and _is_left_out(table, "skew")
+    shaft = shaft if _is_left_out(table, "skew") else None
     sentences = []
-    if gearing is not None and (is_estimated or may_correct) and _is_left_out(table, "drift"):
-        drift = _find_clock_drift(gearing, grid.first(share), shaft if may_correct else None)
+    if gearing is not None and (is_estimated or shaft is not None) and _is_left_out(table, "drift"):
+        drift = _find_clock_drift(gearing, grid.first(share), shaft)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
             delays["theta_s"] = Delay(-drift.value * middle, drift.value)
@@ -283,19 +282,20 @@ def _resample_and_align(
                 f"The clocks drift apart: theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± "
                 f"{1e6 * drift.error:.1g} us each second. This was corrected."
             )
-    initial_delay = delays.get("theta_s", Delay())
+    skew = 0.0
     if is_estimated:
-        delays["theta_s"] = Delay(initial_delay.skew + _estimate_skew(file, gearing, period), initial_delay.drift)
-        grid, gearing = resample()
-    elif may_correct and shaft is not None and gearing is not None:
+        skew = _estimate_skew(file, gearing, period)
+    elif shaft is not None and gearing is not None:
         clock_skew = judge_clock_skew(gearing, grid.first(share), shaft)
         if clock_skew is not None and clock_skew.is_sure:
-            delays["theta_s"] = Delay(initial_delay.skew + clock_skew.value, initial_delay.drift)
-            grid, gearing = resample()
+            skew = clock_skew.value
             sentences.append(_describe_skew(clock_skew, " in the middle of the log" if sentences else ""))
+    if skew:
+        delays["theta_s"] = delays["theta_s"]._replace(skew=delays["theta_s"].skew + skew)
+        grid, gearing = resample()
     if sentences:
         file.warnings.append(" ".join([*sentences, _describe_delay_keys(table, delays["theta_s"])]))
-    if may_correct and any(delays["theta_s"]):
+    if shaft is not None:
         file.corrections |= {key: correction for key, correction in delays["theta_s"]._asdict().items() if correction}
     if not regular:
         purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
@@ -394,10 +394,8 @@ def _correct_offset(
 ) -> None:
     """Subtract a sure offset between the encoders from theta_e; warn of a possible one."""
     integrals = [name for name in POSITION_CHANNELS.values() if table.position_source(name)[0] != name]
-    if not integrals and not _is_left_out(table, "offset"):
-        return
-    offset = find_encoder_offset(grid.first(share), nominal)
-    if offset is None:
+    may_correct = integrals or _is_left_out(table, "offset")
+    if not may_correct or (offset := find_encoder_offset(grid.first(share), nominal)) is None:
         return
     # an integral may begin at any position
     name = integrals[0] if integrals else "theta_e"
@@ -419,11 +417,7 @@ def _correct_offset(
             f"{change:.4g} corrects the same; 0 corrects nothing."
         )
         return
-    cause = (
-        "a constant torque in the shaft"
-        if offset.both_flanks
-        else "a constant torque that holds the load on one flank of a gap"
-    )
+    cause = f"a constant torque {'in the shaft' if offset.both_flanks else 'that holds the load on one flank of a gap'}"
     file.warnings.append(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
         f"[log] theta_e.offset = {change:.4g} corrects it as an offset; 0 corrects nothing."
@@ -442,9 +436,9 @@ def _measure_channel(
     is_position = name.startswith("theta")
     jumps, saturated = 0, raw.saturated
     if is_position:
-        is_even = segmented.sampling.even
+        stamps = None if segmented.sampling.even else segmented.times
         jumps = sum(
-            count_jumps(raw.values[rows], step, None if is_even else segmented.times[rows]) for rows in segmented.segments
+            count_jumps(raw.values[rows], step, None if stamps is None else stamps[rows]) for rows in segmented.segments
         )
     elif not saturated:
         saturated = saturated_share(readings, step)
@@ -480,8 +474,8 @@ def join_records(records: Sequence[Record]) -> Record:
     first = records[0]
     if len(records) == 1:
         return first
-    period, count, end = first.sample_period, 0, 0.0
-    times, segments, logs, notes, warnings = [], [], [], [], []
+    period, end = first.sample_period, 0.0
+    times, segments, logs = [], [], []
     for record in records:
         if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
             raise InputError(
@@ -490,14 +484,12 @@ def join_records(records: Sequence[Record]) -> Record:
             )
         _require_channels(record, _list_channels(first), first)
         _require_channels(first, _list_channels(record), record)
+        count = sum(map(len, times))
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE_PERIODS * period
         segments += [slice(segment.start + count, segment.stop + count) for segment in record.segments]
         logs += [(path, slice(rows.start + count, rows.stop + count)) for path, rows in record.logs]
-        count += len(record.time)
-        notes += [f"{record.path.name}: {note}" for note in record.notes]
-        warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
-    notes.insert(0, f"{len(records)} logs, one after the other: {', '.join(record.path.name for record in records)}.")
+    names = ", ".join(record.path.name for record in records)
     joined = {name: np.concatenate([_list_channels(record)[name] for record in records]) for name in _list_channels(first)}
     return replace(
         first,
@@ -507,8 +499,11 @@ def join_records(records: Sequence[Record]) -> Record:
         transmitted=joined.get("transmitted torque"),
         reference=joined.get("reference"),
         segments=tuple(segments),
-        notes=tuple(notes),
-        warnings=tuple(warnings),
+        notes=(
+            f"{len(records)} logs, one after the other: {names}.",
+            *(f"{record.path.name}: {note}" for record in records for note in record.notes),
+        ),
+        warnings=tuple(f"{record.path.name}: {warning}" for record in records for warning in record.warnings),
         intervals=np.concatenate([record.intervals for record in records]),
         logs=tuple(logs),
     )
@@ -522,6 +517,6 @@ def _require_channels(record: Record, names: Iterable[str], other: Record) -> No
 
 
 def _list_channels(record: Record) -> dict[str, np.ndarray]:
-    torques = {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
-    positions = {f"{side} position": values for side, values in record.positions.items()}
-    return positions | {name: values for name, values in torques.items() if values is not None}
+    channels = {f"{side} position": values for side, values in record.positions.items()}
+    channels |= {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
+    return {name: values for name, values in channels.items() if values is not None}
