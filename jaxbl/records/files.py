@@ -8,6 +8,7 @@ Only the selected columns stay in memory; any other is loaded when it is used.
 
 import csv
 import io
+import itertools
 import json
 import math
 import re
@@ -575,14 +576,8 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
     The last lines of the block hold names and, below them, units; TwinCAT writes Name over each column of times.
     `lines` are the first ones of the text.
     """
-    start = next(
-        (
-            i
-            for i in range(min(len(lines) - 2, _MAX_REMARK_LINES))
-            if _is_number_row(lines[i]) and _is_number_row(lines[i + 1])
-        ),
-        0,
-    )
+    pairs = itertools.pairwise(lines[:-1][: _MAX_REMARK_LINES + 1])
+    start = next((i for i, pair in enumerate(pairs) if all(map(_is_number_row, pair))), 0)
     remarks = [line for line in lines[:start] if has_cells(line)]
     if len(remarks) < 2:
         return None
@@ -600,12 +595,7 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
     frame = pd.read_csv(io.StringIO("\n".join(rows)), header=None, skipinitialspace=True, index_col=False, **signs)
     titles = [cells[:count] for cells in titles if len(cells) >= count]
     scope_names = [cells for cells in titles if cells[0] == "Name"]
-    if scope_names:
-        names, units = scope_names[-1], []
-    elif len(titles) > 1:
-        names, units = titles[-2:]
-    else:
-        names, units = titles[-1] if titles else [], []
+    names, units, *_ = [*(scope_names[-1:] or titles[-2:]), [], []]
     return _name_columns([frame[i].to_numpy() for i in range(count)], names, units)
 
 

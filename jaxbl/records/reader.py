@@ -14,7 +14,7 @@ from jaxbl.lines import DOUBT
 from jaxbl.units import on_a_line
 from jaxbl.validation import check_sizes, explain_first_error
 
-from .alignment import NominalDrive, Skew, find_encoder_offset, judge_clock_skew, max_windup_delay
+from .alignment import NominalDrive, find_encoder_offset, judge_clock_skew, max_windup_delay
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Drift, Gearing, fit_drift, fit_gearing
@@ -289,7 +289,11 @@ def _resample_and_align(
         clock_skew = judge_clock_skew(gearing, grid.first(share), shaft)
         if clock_skew is not None and clock_skew.is_sure:
             skew = clock_skew.value
-            sentences.append(_describe_skew(clock_skew, " in the middle of the log" if sentences else ""))
+            place = " in the middle of the log" if sentences else ""
+            sentences.append(
+                f"theta_s is {_describe_delay(skew, clock_skew.error)} than theta_e{place}. Friction can cause at most "
+                f"{1e3 * clock_skew.max_windup_delay:.2g} ms, so this was corrected."
+            )
     if skew:
         delays["theta_s"] = delays["theta_s"]._replace(skew=delays["theta_s"].skew + skew)
         grid, gearing = resample()
@@ -318,8 +322,7 @@ def _find_torque_keys(
     size, half_periods = abs(lateness.value), lateness.half_periods
     if not (lateness.is_known and is_left_out and size > 3.0 * lateness.error) or half_periods == 0:
         return None
-    direction = "later" if lateness.value > 0.0 else "earlier"
-    text = f"u is {1e3 * size:.3g} ± {1e3 * lateness.error:.1g} ms {direction} than the motion that it causes"
+    text = f"u is {_describe_delay(lateness.value, lateness.error)} than the motion that it causes"
     if half_periods is None:
         file.notes.append(
             f"{text}, which is no multiple of half a period: a filter of u, a soft shaft or a lag may cause it. Nothing was "
@@ -374,12 +377,8 @@ def _is_left_out(table: LogTable, key: str) -> bool:
     return getattr(motor, key, None) is None and getattr(load, key, 0.0) is None
 
 
-def _describe_skew(skew: Skew, place: str) -> str:
-    direction = "later" if skew.value > 0.0 else "earlier"
-    return (
-        f"theta_s is {1e3 * abs(skew.value):.3g} ± {1e3 * skew.error:.1g} ms {direction} than theta_e{place}. Friction can "
-        f"cause at most {1e3 * skew.max_windup_delay:.2g} ms, so this was corrected."
-    )
+def _describe_delay(value: float, error: float) -> str:
+    return f"{1e3 * abs(value):.3g} ± {1e3 * error:.1g} ms {'later' if value > 0.0 else 'earlier'}"
 
 
 def _describe_delay_keys(table: LogTable, delay: Delay) -> str:
