@@ -103,10 +103,8 @@ def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Ske
     phase with the velocity is at most <u ω> / <ω²> for any law of friction: no passive load takes more work than the
     motor gives.
     """
-    if gearing.skew is None or gearing.skew_error is None or "u" not in grid.values:
-        return None
     max_delay = max_windup_delay(grid, nominal)
-    if not math.isfinite(max_delay):
+    if gearing.skew is None or gearing.skew_error is None or not math.isfinite(max_delay):
         return None
     size = abs(gearing.skew)
     # friction makes the load lag, never lead
@@ -140,33 +138,28 @@ def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     regression = _regress_twist(grid, nominal)
     if regression is None:
         return None
-    values, errors = regression.values, regression.errors
     torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration = regression.motion
-    value = float(values[0])
+    value, sure_size = float(regression.values[0]), _SURE_ERRORS * float(regression.errors[0])
     terms = [np.ones(len(torque)), motor_velocity, motor_acceleration, np.sign(motor_velocity)]
     bias, bias_error = (float(x[0]) for x in fit_with_jackknife(torque, np.column_stack(terms)))
     constant = max(abs(float(np.mean(torque))), abs(bias) + 2.0 * bias_error if np.isfinite(bias) else np.inf)
     # a constant torque, or a constant error of u, looks like an offset of that torque over the stiffness
-    error = float(np.hypot(errors[0], constant / nominal.stiffness))
+    windup = constant / nominal.stiffness
     load_torque = nominal.load_inertia * load_acceleration + nominal.load_viscous * load_velocity
-    has_both_flanks = regression.has_both_flanks and constant < float(
-        np.quantile(np.abs(load_torque / nominal.gear_ratio), 0.9)
+    has_both_flanks = (
+        regression.has_both_flanks
+        and constant < float(np.quantile(np.abs(load_torque / nominal.gear_ratio), 0.9))
+        # the twist has to cover the gap, which is up to a third narrower than a data sheet says
+        and regression.twist_range > 1.5 * nominal.half_gap
     )
-    # the twist has to cover the gap, which is up to a third narrower than a data sheet says
-    has_both_flanks = has_both_flanks and regression.twist_range > 1.5 * nominal.half_gap
     gap_share = 0.0 if has_both_flanks else _NOMINAL_FACTOR * nominal.half_gap
-    torque_rms = rms(torque)
-    if nominal.stiffness * (abs(value) - gap_share) < _MIN_TORQUE_SHARE * torque_rms or abs(
-        value
-    ) - gap_share < _SURE_ERRORS * float(errors[0]):
+    if abs(value) - gap_share < max(sure_size, _MIN_TORQUE_SHARE * rms(torque) / nominal.stiffness):
         return None
     # the constant torque, or a stiffness that is half as large again, may explain all of it
-    if abs(value) < (1.0 if has_both_flanks else 0.5) * constant / nominal.stiffness:
+    if abs(value) < (1.0 if has_both_flanks else 0.5) * windup:
         return None
-    is_sure = (
-        has_both_flanks and abs(value) > _SURE_ERRORS * float(errors[0]) + _NOMINAL_FACTOR * constant / nominal.stiffness
-    )
-    return Offset(value, error, has_both_flanks, is_sure)
+    is_sure = has_both_flanks and abs(value) > sure_size + _NOMINAL_FACTOR * windup
+    return Offset(value, float(np.hypot(regression.errors[0], windup)), has_both_flanks, is_sure)
 
 
 class _Regression(NamedTuple):

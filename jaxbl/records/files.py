@@ -402,7 +402,14 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
         """Return the names of all columns, the values of the selected ones, and the number of rows."""
         chunks: Any = pd.read_csv(
             path,
-            **text_format.pandas_options(),
+            sep=text_format.separator,
+            header=None,
+            names=text_format.names,
+            comment="#",
+            skipinitialspace=True,
+            decimal=text_format.decimal,
+            thousands=text_format.thousands,
+            index_col=False,
             skiprows=text_format.first_row,
             low_memory=False,
             encoding=encoding,
@@ -475,19 +482,6 @@ class TextFormat(NamedTuple):
     count: int
     first_row: int
     units: Sequence[str] = ()
-
-    def pandas_options(self) -> Any:
-        """Return the keywords for `pandas.read_csv`."""
-        return {
-            "sep": self.separator,
-            "header": None,
-            "names": self.names,
-            "comment": "#",
-            "skipinitialspace": True,
-            "decimal": self.decimal,
-            "thousands": self.thousands,
-            "index_col": False,
-        }
 
     def parse_row(self, line: str) -> list[float] | None:
         """Parse a row into numbers, NaN for a cell that is none; None if there are more cells or fewer."""
@@ -582,8 +576,6 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
     if len(remarks) < 2:
         return None
     separator = _find_separator(lines[start : start + 1])
-    if separator == _WHITE_SPACE:
-        return None
     count = len(_split_cells(lines[start], separator))
     is_known_program = any(title in line for line in remarks for title in ("EPOS Studio", "Starttime of export"))
     titles = [_split_cells(line, separator) for line in remarks]
@@ -700,7 +692,7 @@ def _add_columns(columns: Columns, name: str, value: Any) -> None:
     if not isinstance(value, dict):
         value = np.squeeze(np.asarray(value))
         if "s2" in (value.dtype.names or ()):
-            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({value['s2'].item().decode()})")
+            columns.unread[_MATLAB_OBJECTS].append(f"{name} ({value['s2'].item().decode()})")
             return
         if value.dtype.names and not value.ndim:
             value = {field: value[field] for field in value.dtype.names}
@@ -740,7 +732,7 @@ def _read_matlab(path: Path, selection: Selection) -> Columns:
         elif re.fullmatch(r"double|single|logical|u?int\d+", kind):
             _add_vectors(columns, name, shape, partial(load_variable, name))
         elif kind != "char":
-            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({kind})")
+            columns.unread[_MATLAB_OBJECTS].append(f"{name} ({kind})")
     # a message that lists columns has to know their names
     for name in postponed if not any(column in columns for column in selection) else ():
         _add_columns(columns, name, load_variable(name))
@@ -803,7 +795,7 @@ def _read_hdf5(path: Path) -> Columns:
             if isinstance(link, h5py.HardLink):
                 add_dataset(member, node[place])
             else:
-                columns.unread.setdefault(_LINKS, []).append(member)
+                columns.unread[_LINKS].append(member)
 
         return node.visititems_links(add_member)
 
@@ -813,9 +805,9 @@ def _read_hdf5(path: Path) -> Columns:
             return
         matlab_class = node.attrs.get("MATLAB_class", b"").decode()
         if node.is_virtual or node.external:
-            columns.unread.setdefault(_LINKS, []).append(name)
+            columns.unread[_LINKS].append(name)
         elif "MATLAB_object_decode" in node.attrs:
-            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({matlab_class})")
+            columns.unread[_MATLAB_OBJECTS].append(f"{name} ({matlab_class})")
         elif node.dtype.kind in "biuf" and matlab_class != "char":
             _add_vectors(columns, name, node.shape, partial(load_dataset, node.name))
         # cells, and structures with several elements; they may hold one another

@@ -179,13 +179,11 @@ class Drift:
     Attributes:
         value: s/s.
         error: standard error.
-        skew: in the middle of the log, s.
         reach: change of the skew over half of the log, s.
     """
 
     value: float
     error: float
-    skew: float
     reach: float
 
 
@@ -194,11 +192,12 @@ _FOLDS = 10
 
 
 def fit_drift(grid: Grid, skew: float) -> Drift | None:
-    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`."""
+    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`.
+
+    The log is one that :func:`fit_gearing` can fit.
+    """
     period = grid.period
     width = _velocity_bandwidth(grid.values["theta_s"][longest_segment(grid.segments)], period)
-    if not width or not long_segments(grid.segments):
-        return None
     constant = _regress_motor(grid, 4.0 * width, skew)
     drift, fit, error, reach = 0.0, None, np.inf, 0.0
     half = 0.5 * float(grid.time[-1] - grid.time[0])
@@ -224,7 +223,7 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
     better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
     if not better or abs(drift) < 6.0 * abs(error) or reach < 0.05 * period:
         return None
-    return Drift(drift, abs(error), skew, reach)
+    return Drift(drift, abs(error), reach)
 
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:

@@ -191,11 +191,9 @@ def main_side(record: Record) -> str:
 def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Differentiate the low-passed position of a side, by default the main one; rad/s (m/s), shape (samples,)."""
     side = side or main_side(record)
-    width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
-    speed = np.zeros(len(record.time))
-    for s in record.segments:
-        _, speed[s], _ = low_pass_motion(record.positions[side][s], 4.0 * width or math.inf, record.sample_period)
-    return speed
+    cutoff = 4.0 * record.statistics.channels[POSITION_CHANNELS[side]].bandwidth or math.inf
+    places = [record.positions[side][segment] for segment in record.segments]
+    return np.concatenate([low_pass_motion(place, cutoff, record.sample_period)[1] for place in places])
 
 
 def _is_moving(speed: np.ndarray) -> np.ndarray:

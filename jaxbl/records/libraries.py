@@ -5,7 +5,9 @@
 
 import json
 from array import array
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from itertools import islice
@@ -36,13 +38,14 @@ class Columns(dict[ColumnName, Any]):
         super().__init__(*args, **kwargs)
         self.units: dict[ColumnName, str] = {}
         self.notes: list[str] = []
-        self.unread: dict[str, list[str]] = {}
+        self.unread = defaultdict[str, list[str]](list)
 
     def describe_unread(self) -> list[str]:
         """Return a sentence on each kind of what was not read."""
         return [f"Not read: {', '.join(names[:20])}: {reason}." for reason, names in self.unread.items() if names]
 
 
+@dataclass
 class Column:
     """Values of a column that are loaded when they are used.
 
@@ -51,8 +54,8 @@ class Column:
         rows: number of values.
     """
 
-    def __init__(self, load: Callable[[], Any], rows: int):
-        self.load, self.rows = load, rows
+    load: Callable[[], Any]
+    rows: int
 
     def __len__(self) -> int:
         return self.rows
@@ -150,11 +153,11 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     if summary is None or summary.statistics is None:
         raise InputError("has no summary at its end: it was not closed; 'mcap recover' mends it")
     types: dict[int, Any] = {}
-    counts, other_topics = {}, list[str]()
+    counts, other_topics = Counter[str](), list[str]()
     for number, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         if channel.message_encoding == "json" or (channel.message_encoding == "cdr" and schema is not None):
-            counts[channel.topic] = counts.get(channel.topic, 0) + summary.statistics.channel_message_counts.get(number, 0)
+            counts[channel.topic] += summary.statistics.channel_message_counts.get(number, 0)
         else:
             other_topics.append(f"{channel.topic} ({channel.message_encoding})")
 
@@ -192,9 +195,9 @@ def read_bag(path: Path, selection: Selection = ()) -> Columns:
     """
     library = _import_library("rosbags.highlevel", "a ROS bag", "rosbags")
     with library.AnyReader([path]) as reader:
-        counts: dict[str, int] = {}
+        counts = Counter[str]()
         for connection in reader.connections:
-            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+            counts[connection.topic] += connection.msgcount
 
     def iterate_messages(topics: Collection[str]) -> _Messages:
         with library.AnyReader([path]) as reader:

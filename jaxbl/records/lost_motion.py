@@ -134,15 +134,14 @@ def _average_passes(
 
 
 def _shift_between_states(
-    cells: _Cells, is_late: np.ndarray, selection: np.ndarray | bool = True
+    cells: _Cells, is_late: np.ndarray, selection: np.ndarray | slice = slice(None)
 ) -> tuple[float, np.ndarray]:
     """Return the biweight location of the shifts at places that were crossed in both states, and these shifts.
 
     Where the load hardly pulls, the gap is not crossed in full: the shifts of such places are smaller, and count less.
     """
-    states = [~is_late & selection, is_late & selection]
-    counts = np.array([np.bincount(cells.group[state], minlength=2 * BINS) for state in states])
-    sums = np.array([np.bincount(cells.group[state], cells.twist[state], minlength=2 * BINS) for state in states])
+    index, twist = (cells.group + 2 * BINS * is_late)[selection], cells.twist[selection]
+    counts, sums = (np.bincount(index, weights, 4 * BINS).reshape(2, -1) for weights in (None, twist))
     crossed_twice = (counts > 0).all(axis=0)
     if crossed_twice.sum() < 4:
         return math.nan, np.zeros(0)
@@ -229,25 +228,21 @@ def fit_lost_motion_by_load(
     # two levels stand apart; a drift does not
     if abs(value) < 6.0 * residual or not _explains_more_than_drift(cells, residuals):
         return None
-    passes = np.unique(cells.pass_number)
-    groups = np.array_split(np.arange(BINS), BLOCKS)
-    without_passes = [_shift_between_states(cells, state, cells.pass_number != p)[0] for p in passes]
-    without_places = [
-        _shift_between_states(cells, state, ~np.isin(cells.place, g))[0] for g in groups if np.isin(cells.place, g).any()
-    ]
-    variance = 0.0
-    for without in (without_passes, without_places):
+    variance, passes = 0.0, len(np.unique(cells.pass_number))
+    # by passes, and by neighbouring places
+    for blocks in (cells.pass_number, cells.place // (BINS // BLOCKS)):
+        without = [_shift_between_states(cells, state, blocks != block)[0] for block in np.unique(blocks)]
         finite = [value for value in without if math.isfinite(value)]
         if len(finite) < max(3, len(without) - 1):
             return None
         variance += float(jackknife_variance(finite))
     size, error = abs(value), math.sqrt(variance)
     changes = np.flatnonzero(np.diff(state))
-    if size < 8.0 * error or len(changes) > len(passes):
+    if size < 8.0 * error or len(changes) > passes:
         return None
     change_times = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in changes)
     least, largest = np.quantile(math.copysign(1.0, value) * shifts, [0.1, 0.9])
-    interval = student_interval(size, error, min(len(passes), BLOCKS) - 1)
+    interval = student_interval(size, error, min(passes, BLOCKS) - 1)
     return LostMotion(
         size, error, interval, "load", len(change_times), change_times, (float(least), float(largest)), residual
     )

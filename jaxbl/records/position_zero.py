@@ -111,9 +111,10 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1] - 1]
     signals = np.column_stack([torque, (rows.waves[:, waves] @ turns).real])
     residuals = fit_residual(signals, np.column_stack([rows.columns[:, ~varies], np.ones(len(signals))]))
-    blocks = np.array_split(np.arange(len(signals)), BLOCKS)
-    squares_without_waves = np.array([np.sum(residuals[block, 0] ** 2) for block in blocks])
-    squares = np.array([np.sum((residuals[block, :1] - residuals[block, 1:]) ** 2, axis=0) for block in blocks])
+    # without waves, and with those at each shift
+    residuals[:, 1:] -= residuals[:, :1]
+    block_squares = np.array([np.sum(part**2, axis=0) for part in np.array_split(residuals, BLOCKS)])
+    squares_without_waves, squares = block_squares[:, 0], block_squares[:, 1:]
     total = squares.sum(axis=0)
     best = int(np.argmin(total))
     if not _error_reduction(squares_without_waves, squares[:, best]) > _SURE_SHIFT_ERRORS:
@@ -126,7 +127,7 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     step = shifts[1] - shifts[0]
     value, *without = (
         shifts[chosen] + step * (_parabola_minimum(sums[near]) - _SHIFTS_PER_PERIOD // 2)
-        for sums in (total, *(total - block_squares for block_squares in squares))
+        for sums in (total, *(total - squares))
     )
     error = float(np.sqrt(jackknife_variance(without)))
     if not abs(value) > _SURE_ERRORS * error:

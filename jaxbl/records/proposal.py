@@ -137,7 +137,9 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         table |= _add_candidates_by_values(file, candidates, guesses)
     chosen: dict[str, _Candidate] = {}
     # the torque is chosen to the position
-    for channel in sorted(candidates, key=("t", "theta_e", "theta_s", "omega_e", "omega_s", "u").index):
+    for channel in sorted(
+        filter(candidates.get, candidates), key=("t", "theta_e", "theta_s", "omega_e", "omega_s", "u").index
+    ):
         words = {word for candidate in chosen.values() for word in candidate.name.split()}
         chosen[channel] = _choose(candidates[channel], words)
     if "theta_e" in chosen and not chosen["theta_e"].is_second_choice and chosen.get("theta_s", ("",) * 3)[2] == "load":
@@ -190,10 +192,8 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
             table["t"] = {"period": period}
             guesses.append(f"The period is taken to be {period:g} s: a speed then is the slope of the position.")
     for channel, column in by_values.items():
-        for other, columns in [*candidates.items()]:
-            candidates[other] = [candidate for candidate in columns if candidate.column != column]
-            if not candidates[other]:
-                del candidates[other]
+        for columns in candidates.values():
+            columns[:] = [candidate for candidate in columns if candidate.column != column]
         candidates[channel] = [_Candidate(False, column, *_split_unit(file, column), signals[column])]
         guesses.append(f"{channel} is taken to be column '{column}' by how its numbers change.")
     return table
@@ -273,8 +273,9 @@ def propose_study(
         pass
     if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
         rough = _fit_nominal_drive(inspection, guesses, gear_ratio)
-        numbers = {name: value for name, value in vars(rough).items() if name not in ("gear_ratio", "dead_time")}
-        nominal = replace(rough, **{name: _round_to_3_digits(value) for name, value in numbers.items()})
+        exact = "gear_ratio", "dead_time"
+        rounded = {name: _round_to_3_digits(value) for name, value in vars(rough).items() if name not in exact}
+        nominal = replace(rough, **rounded)
     else:
         guesses.append("The numbers of the drive are those of the model.")
     ratio = (gear_ratio or nominal.gear_ratio) if math.isfinite(nominal.stiffness) else None
