@@ -133,13 +133,11 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
             candidates.setdefault(channel, []).append(_Candidate(is_second_choice, column, name, unit, values))
     guesses: list[str] = []
     table: _Table = {}
-    if not candidates.get("t") or not _POSITIONS & {*candidates}:
+    if "t" not in candidates or candidates.keys().isdisjoint(_POSITIONS):
         table |= _add_candidates_by_values(file, candidates, guesses)
     chosen: dict[str, _Candidate] = {}
     # the torque is chosen to the position
-    for channel in sorted(
-        filter(candidates.get, candidates), key=("t", "theta_e", "theta_s", "omega_e", "omega_s", "u").index
-    ):
+    for channel in filter(candidates.get, ("t", *_POSITIONS, "u")):
         words = {word for candidate in chosen.values() for word in candidate.name.split()}
         chosen[channel] = _choose(candidates[channel], words)
     if "theta_e" in chosen and not chosen["theta_e"].is_second_choice and chosen.get("theta_s", ("",) * 3)[2] == "load":
@@ -151,7 +149,7 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         # a measured position is better than the integral of a speed
         if channel.replace("omega", "theta") not in {*chosen} - {channel}:
             table[channel] = _make_table(channel, candidate, guesses)
-    if not _POSITIONS & {*table}:
+    if table.keys().isdisjoint(_POSITIONS):
         columns = ", ".join(map(str, file.columns))
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
     if "u" not in table:
@@ -162,7 +160,7 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     return table, guesses
 
 
-_POSITIONS = {"theta_e", "theta_s", "omega_e", "omega_s"}
+_POSITIONS = "theta_e", "theta_s", "omega_e", "omega_s"
 """Channels of which a log has one at least."""
 
 
@@ -178,7 +176,7 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
     if times is None and (stamps := find_stamps(signals)) is not None:
         by_values["t"], times = stamps, signals[stamps]
     table: _Table = {}
-    if not _POSITIONS & {*candidates}:
+    if candidates.keys().isdisjoint(_POSITIONS):
         named = {candidate.column for columns in candidates.values() for candidate in columns}
         moving = {
             column: values.astype(float)

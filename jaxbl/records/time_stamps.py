@@ -190,9 +190,9 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
 
 def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
     """Tell which rows have a value in every channel: one that is logged less often has none in most rows."""
-    is_full = np.ones(count, dtype=bool)
-    for column in table.list_columns() - {*(table.absent or ())}:
-        if column in file.columns and file.count_values(column) == count:
+    is_full, needed_columns = np.ones(count, dtype=bool), table.list_columns() - {*(table.absent or ())}
+    for column in file.columns:
+        if column in needed_columns and file.count_values(column) == count:
             has_value = pd.notna(file.load_values(column))
             if has_value.sum() >= MIN_SAMPLES and not has_value.all():
                 is_full &= has_value
