@@ -45,12 +45,15 @@ _MAX_RELATIVE_ERROR = 0.5
 """Relative standard error from which on a number counts as open; as in `jaxbl identify`."""
 _REVERSAL_NOISE = 6.0
 """Rms noises of the displacement that a reversal has to exceed: white noise over the length of a log does not."""
-_HALF_GAP_STARTS = 0.02, 0.1, 0.3, 0.5, 0.7
-"""Half gaps at which searches start, over half the range of the displacement."""
-_CENTRE_STARTS = -0.5, -0.2, 0.0, 0.2, 0.5
-"""Centres of the gap at which searches start, from the middle of the range, over half of it."""
-_LENGTH_STARTS = 0.02, 0.06, 0.2, 0.6
-"""Lengths of the hysteresis, and windups of a slipping transmission, at which searches start, over half the range."""
+_SHAPE_STARTS = {
+    "centre": (-0.5, -0.2, 0.0, 0.2, 0.5),
+    "half_gap": (0.02, 0.1, 0.3, 0.5, 0.7),
+    "length": (0.02, 0.06, 0.2, 0.6),
+    "windup": (0.02, 0.06, 0.2, 0.6),
+}
+"""Nonlinear number -> where searches start, over half the range of the displacement; the centre from the middle of it."""
+_SHAPE_BOUNDS = {"centre": (-1.0, 1.0), "half_gap": (0.0, 1.0), "length": (1e-4, 10.0), "windup": (1e-4, 1.0)}
+"""Bounds of the search, likewise."""
 _SERIES = "gap", "slip"
 """Terms of play, spring and slip in series."""
 
@@ -352,10 +355,9 @@ def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
 def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model:
     """Drop terms with a negative size; if `new_term` is among them, return the model unchanged."""
     while True:
-        sized_terms = [term for term in model.terms if term in SIZE_NAMES]
-        positive_terms = {term for term, size in zip(sized_terms, model.sizes[2:], strict=True) if size > 0.0}
-        terms = tuple(term for term in model.terms if term not in SIZE_NAMES or term in positive_terms)
-        if terms == model.terms or (new_term in SIZE_NAMES and new_term not in positive_terms):
+        sizes = dict(zip((term for term in model.terms if term in SIZE_NAMES), model.sizes[2:], strict=True))
+        terms = tuple(term for term in model.terms if sizes.get(term, 1.0) > 0.0)
+        if terms == model.terms or not sizes.get(new_term, 1.0) > 0.0:
             return model
         model = _fit_model(rig, terms, model)
 
@@ -373,25 +375,22 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     names = _shape_names(terms)
     half, middle = rig.half_range, 0.5 * (float(rig.position.min()) + float(rig.position.max()))
     near_shapes = dict(zip(_shape_names(near.terms), near.shapes, strict=True)) if near is not None else {}
-    choices = {
-        "centre": ([middle + half * start for start in _CENTRE_STARTS], middle - half, middle + half),
-        "half_gap": ([half * start for start in _HALF_GAP_STARTS], 0.0, half),
-        "length": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, 10.0 * half),
-        "windup": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, half),
-    }
+
+    def scale_shapes(name: str, shares: tuple[float, ...]) -> list[float]:
+        return [half * share + (middle if name == "centre" else 0.0) for share in shares]
 
     def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
         return fit_residual(rig.fitted_torque, rig.compute_columns(terms, shapes))
 
     shapes = np.empty(0)
     if names:
-        low, high = np.array([choices[name][1:] for name in names]).T
+        low, high = np.array([scale_shapes(name, _SHAPE_BOUNDS[name]) for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
-        starts = itertools.product(*([near_shapes[name]] if name in near_shapes else choices[name][0] for name in names))
-        starts = sorted(starts, key=lambda start: float(np.mean(compute_residual(np.array(start), few) ** 2)))[:3]
+        choices = ([near_shapes[name]] if name in near_shapes else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
+        starts = sorted(map(np.array, itertools.product(*choices)), key=lambda start: rms(compute_residual(start, few)))
         inside = low + 1e-9 * half, high - 1e-9 * half
-        solutions = [search(np.clip(np.array(start), *inside), args=(few,)) for start in starts]
+        solutions = [search(np.clip(start, *inside), args=(few,)) for start in starts[:3]]
         best = min(solutions, key=lambda solution: solution.cost)
         shapes = search(best.x, args=(rig,)).x
     columns = rig.compute_columns(terms, shapes)

@@ -131,8 +131,8 @@ _FIRST_MESSAGES = 100
 """Messages of a topic whose names are listed before any of it is selected: several publishers may write to it."""
 
 
-_Messages = Iterator[tuple[str, int, Any]]
-"""Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
+_Messages = Iterator[tuple[int, Any]]
+"""Messages of a topic in the order of time: time of recording in ns, the decoded message."""
 
 
 def name_members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -161,15 +161,15 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
         else:
             other_topics.append(f"{channel.topic} ({channel.message_encoding})")
 
-    def iterate_messages(topics: Collection[str]) -> _Messages:
+    def iterate_messages(topic: str) -> _Messages:
         with path.open("rb") as file:
-            for schema, channel, message in library.make_reader(file, validate_crcs=True).iter_messages(topics=list(topics)):
+            for schema, channel, message in library.make_reader(file, validate_crcs=True).iter_messages(topics=[topic]):
                 if channel.message_encoding == "json":
-                    yield channel.topic, message.log_time, json.loads(message.data, object_pairs_hook=name_members)
+                    yield message.log_time, json.loads(message.data, object_pairs_hook=name_members)
                 else:
                     if schema.id not in types:
                         types[schema.id] = _message_types(schema)
-                    yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
+                    yield message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
 
     columns = _recording_columns(counts, iterate_messages, selection)
     columns.unread["messages in other formats than JSON and ROS 2"] = other_topics
@@ -199,21 +199,21 @@ def read_bag(path: Path, selection: Selection = ()) -> Columns:
         for connection in reader.connections:
             counts[connection.topic] += connection.msgcount
 
-    def iterate_messages(topics: Collection[str]) -> _Messages:
+    def iterate_messages(topic: str) -> _Messages:
         with library.AnyReader([path]) as reader:
-            connections = [connection for connection in reader.connections if connection.topic in topics]
+            connections = [connection for connection in reader.connections if connection.topic == topic]
             for connection, time, message in reader.messages(connections=connections):
-                yield connection.topic, time, reader.deserialize(message, connection.msgtype)
+                yield time, reader.deserialize(message, connection.msgtype)
 
     return _recording_columns(counts, iterate_messages, selection)
 
 
 def _recording_columns(
-    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Selection
+    counts: dict[str, int], iterate_messages: Callable[[str], _Messages], selection: Selection
 ) -> Columns:
     """Return the columns of a recording. All messages of the selected topics are read, of others the first ones.
 
-    `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of topics.
+    `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of a topic.
     """
     loaded_values: dict[ColumnName, np.ndarray] = {}
     times: dict[str, np.ndarray] = {}
@@ -221,7 +221,7 @@ def _recording_columns(
     def load_topic(topic: str, names: list[ColumnName]) -> dict[str, None]:
         """Load the times and some columns of a topic; return the names of all its columns."""
         stamps, recording_times, rows, field_names = array("q"), array("q"), array("d"), dict[str, None]()
-        for _, time, message in iterate_messages([topic]):
+        for time, message in iterate_messages(topic):
             numbers = dict(_find_numbers(message, topic, {}))
             field_names |= dict.fromkeys(numbers)
             stamps.append(_find_stamp(message))
@@ -238,11 +238,12 @@ def _recording_columns(
     selected_topics = list[str]()
     for topic in filter(counts.get, counts):
         names = [name for name in selection if str(name).startswith(f"{topic}.")]
-        selected_topics += [topic] if names else []
-        messages = () if names else islice(iterate_messages([topic]), _FIRST_MESSAGES)
-        field_names = (
-            load_topic(topic, names) if names else [name for m in messages for name, _ in _find_numbers(m[2], topic, {})]
-        )
+        if names:
+            selected_topics.append(topic)
+            field_names = load_topic(topic, names)
+        else:
+            messages = islice(iterate_messages(topic), _FIRST_MESSAGES)
+            field_names = [name for _, message in messages for name, _ in _find_numbers(message, topic, {})]
         places |= dict.fromkeys(field_names, topic)
     if not places:
         raise InputError("holds no messages with numbers; a log needs them")
