@@ -91,9 +91,14 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
 
 
 def _read_numbers(
-    file: LogFile, name: str, column: ColumnName, table: PositionTable | SpeedTable | TorqueTable, stamps: TimeStamps
+    file: LogFile,
+    name: str,
+    table: PositionTable | SpeedTable | TorqueTable,
+    stamps: TimeStamps,
+    other_column: ColumnName | None = None,
 ) -> np.ndarray:
-    """Read the numbers of a column at the selected rows; words become signed numbers."""
+    """Read the numbers of a channel's column, or of another one, at the selected rows; words become signed numbers."""
+    column = table.column_or(name) if other_column is None else other_column
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
     values = file.load_numbers(column, f"{name}.column", stamps.rows)
     signed_words = decode_words(table, values)
@@ -139,13 +144,13 @@ SPEED_FACTORS = {
 
 
 def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
-    column = table.column_or(name)
-    values = _read_numbers(file, name, column, table, stamps)
+    values = _read_numbers(file, name, table, stamps)
     if table.minus is not None:
-        values = values - _read_numbers(file, name, table.minus, table, stamps)
+        values = values - _read_numbers(file, name, table, stamps, table.minus)
     if np.ptp(values) == 0.0:
         raise file.error(
-            f'column {column!r} ({name}) is {values[0]:g} in all rows; it should move; absent = ["{name}"] leaves it out'
+            f"column {table.column_or(name)!r} ({name}) is {values[0]:g} in all rows; it should move; "
+            f'absent = ["{name}"] leaves it out'
         )
     if table.wrap is None:
         _check_wrap(file, name, table, values, stamps)
@@ -163,7 +168,7 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
 
 def _read_reference(file: LogFile, table: PositionTable, stamps: TimeStamps) -> RawChannel:
     """Read what a controller was given: it may stand still or jump."""
-    values = _read_numbers(file, "reference", table.column_or("reference"), table, stamps)
+    values = _read_numbers(file, "reference", table, stamps)
     values = to_si(table, values if table.wrap is None else _unwrap(file, "reference", table, values))
     return RawChannel(values, table.si_unit, table.skew or 0.0)
 
@@ -172,10 +177,9 @@ def _integrate_speed(file: LogFile, name: str, channel: str, table: SpeedTable, 
     """Integrate a speed to a position by the trapezoidal rule, 0 at the first row."""
     from scipy.integrate import cumulative_trapezoid
 
-    column = table.column_or(channel)
-    values = _read_numbers(file, channel, column, table, stamps)
+    values = _read_numbers(file, channel, table, stamps)
     if np.ptp(values) == 0.0:
-        raise file.error(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
+        raise file.error(f"column {table.column_or(channel)!r} ({channel}) is {values[0]:g} in all rows; it should change")
     step = find_resolution(values)
     position = cumulative_trapezoid(to_si(table, values), stamps.times, initial=0.0)
     step_text = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
@@ -188,7 +192,7 @@ def _integrate_speed(file: LogFile, name: str, channel: str, table: SpeedTable, 
 
 def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, is_linear: bool) -> RawChannel:
     column = table.column_or(name)
-    values = _read_numbers(file, name, column, table, stamps)
+    values = _read_numbers(file, name, table, stamps)
     if is_linear and table.unit == "N m":
         raise file.error(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
     if table.signed_bits is None and table.sign_bit is None:

@@ -235,12 +235,11 @@ def read_log_file(path: Path, selection: Selection = ()) -> LogFile:
             columns = _read_columns(path, selection)
         except IsADirectoryError:
             raise InputError("is a folder; a log file is needed") from None
-        if not all(str(name).isprintable() for name in columns):
-            printable_columns = {
-                escape_unprintable(name) if isinstance(name, str) else name: values for name, values in columns.items()
-            }
-            columns.clear()
-            columns.update(printable_columns)
+        printable_columns = {
+            escape_unprintable(name) if isinstance(name, str) else name: values for name, values in columns.items()
+        }
+        columns.clear()
+        columns.update(printable_columns)
         return LogFile(path, columns)
 
 

@@ -89,7 +89,6 @@ class Inspection:
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `inspection.json`."""
         record, statistics = self.record, self.record.statistics
-        dynamics = statistics.dynamics
         return {
             "file": str(record.path.resolve()),
             "samples": len(record.time),
@@ -97,11 +96,9 @@ class Inspection:
             "start": record.start,
             "closed_loop": record.closed_loop,
             "segments": [[float(record.time[s][0]), float(record.time[s][-1])] for s in record.segments],
-            "sampling": asdict(statistics.sampling),
-            "channels": {name: asdict(channel) for name, channel in statistics.channels.items()},
             "gear_ratio": self.gear_ratio,
-            "gearing": None if statistics.gearing is None else asdict(statistics.gearing),
-            "dynamics": None if dynamics is None else dynamics.to_dict(),
+            **asdict(statistics),
+            "dynamics": None if statistics.dynamics is None else statistics.dynamics.to_dict(),
             "reversals": self.reversals,
             "element": None if self.element is None else self.element.to_dict(),
             "identifiable": [
@@ -134,10 +131,7 @@ def inspect(
         ratio = None
     speed = compute_velocity(record)
     reversals = _count_reversals(record, speed)
-    rigid = _judge_rigid_drive(record, speed, reversals)
-    if gearing is not None and gearing.is_loose:
-        rigid = [_weaken_for_loose_load(judgement) for judgement in rigid]
-    judgements = [*rigid, *_judge_transmission(record, speed, reversals, ratio)]
+    judgements = _judge_rigid_drive(record, speed, reversals) + _judge_transmission(record, speed, reversals, ratio)
     return Inspection(record, table, ratio, reversals, tuple(judgements))
 
 
@@ -256,15 +250,11 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
     if fast < 1.5 * slow:
         reason = f"{speeds} are too close to separate viscous from Coulomb friction"
         judgements[1:] = _judge_alike(friction, "weak", reason)
+    gearing = record.statistics.gearing
+    if gearing is not None and gearing.is_loose:
+        doubt = "by a fit of a rigid drive, while here the load follows the motor only loosely"
+        judgements = [replace(judgement, answer="weak", reason=f"{judgement.reason}; {doubt}") for judgement in judgements]
     return [*judgements, constant]
-
-
-def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:
-    """Weaken a judgement by a fit of a rigid body, which says little of a motor whose load follows only loosely."""
-    if judgement.answer == "no" or judgement.quantity == "constant torque":
-        return judgement
-    reason = f"{judgement.reason}; by a fit of a rigid drive, while here the load follows the motor only loosely"
-    return replace(judgement, answer="weak", reason=reason)
 
 
 def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Identifiability]:

@@ -167,17 +167,15 @@ def _find_states(cells: _Cells) -> np.ndarray | None:
     centred_twist = cells.subtract_group_means(cells.twist)
     # a single change: the step, less its mean in each place and direction, that fits best
     changes = np.arange(2, count - 1, max(count // 400, 1))
-    before = np.cumsum(np.arange(2 * BINS) == cells.group[:, None], axis=0)[changes - 1]
-    crossed = np.bincount(cells.group, minlength=2 * BINS)
-    size = np.sum(before * (1.0 - before / np.maximum(crossed, 1)), axis=1)
-    gain = np.where(size > 1e-9, np.cumsum(centred_twist)[changes - 1] ** 2 / np.maximum(size, 1e-9), 0.0)
-    starts = [np.arange(count) >= changes[np.argmax(gain)]] if gain.max(initial=0.0) > 0.0 else []
+    passed = np.cumsum(np.arange(2 * BINS) == cells.group[:, None], axis=0)
+    before = passed[changes - 1]
+    size = np.sum(before * (1.0 - before / np.maximum(passed[-1], 1)), axis=1)
+    gain = np.cumsum(centred_twist)[changes - 1] ** 2 / np.maximum(size, 1e-9)
     smooth = np.nanmedian(
         np.lib.stride_tricks.sliding_window_view(np.pad(centred_twist, 4, constant_values=np.nan), 9), axis=1
     )
-    starts.append(smooth > 0.5 * (smooth.min() + smooth.max()))
     best = None
-    for state in starts:
+    for state in (np.arange(count) >= changes[np.argmax(gain)], smooth > 0.5 * (smooth.min() + smooth.max())):
         for _ in range(12):
             shift, _ = _shift_between_states(cells, state)
             if not math.isfinite(shift) or shift == 0.0:

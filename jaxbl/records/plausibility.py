@@ -355,20 +355,15 @@ def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: np.nda
         )
 
 
-def note_skew(file: LogFile, gearing: Gearing, period: float) -> None:
-    """Remark on a skew between both encoders that is significant and more than 5 % of the `period`, s."""
-    if gearing.skew is None or gearing.skew_error is None:
-        return
-    if abs(gearing.skew) > 6.0 * gearing.skew_error and abs(gearing.skew) > 0.05 * period:
-        direction = "lags" if gearing.skew > 0.0 else "leads"
+def note_gearing(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelStatistics], period: float) -> None:
+    """Remark on a significant skew of more than 5 % of the `period`, s, and on a lost motion that exceeds the noise."""
+    skew, error = gearing.skew or 0.0, gearing.skew_error or 0.0
+    if abs(skew) > max(6.0 * error, 0.05 * period):
+        direction = "lags" if skew > 0.0 else "leads"
         file.notes.append(
-            f"theta_s {direction} theta_e by {1e3 * abs(gearing.skew):.3g} ± {1e3 * gearing.skew_error:.2g} ms: a skew of "
+            f"theta_s {direction} theta_e by {1e3 * abs(skew):.3g} ± {1e3 * error:.2g} ms: a skew of "
             "the stamps, or viscous friction of the load that winds up the shaft; this log cannot tell them apart."
         )
-
-
-def note_lost_motion(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelStatistics]) -> None:
-    """Remark on the lost motion if it exceeds the noise of both encoders."""
     unit = statistics["theta_e"].unit
     text = f"Lost motion at the motor: {gearing.describe_lost_motion(unit)}"
     if gearing.flank == "load":

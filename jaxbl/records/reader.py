@@ -26,9 +26,8 @@ from .plausibility import (
     check_torque_sign,
     flag_wrong_units,
     note_channel_faults,
+    note_gearing,
     note_host_stamps,
-    note_lost_motion,
-    note_skew,
     note_standstill,
 )
 from .resampling import Delay, Grid, resample_channels
@@ -204,8 +203,7 @@ def read_record(
     if gearing is not None:
         gearing = replace(gearing, flank_times=tuple(t - float(grid.time[0]) for t in gearing.flank_times))
         statistics["theta_s"] = replace(statistics["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
-        note_skew(file, gearing, grid.period)
-        note_lost_motion(file, gearing, statistics)
+        note_gearing(file, gearing, statistics, grid.period)
     if lateness is not None and lateness.error < segmented.period:
         statistics["u"] = replace(statistics["u"], skew=lateness.value, skew_error=lateness.error)
     return Record(
