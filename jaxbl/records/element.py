@@ -258,14 +258,14 @@ def _average_samples(log: RigLog) -> RigLog:
 def _prepare_rig(log: RigLog) -> _Rig | None:
     position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
-    smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
+    cutoff = _CUTOFF_RATIO * width or math.inf
+    smooth, rate, direction = np.zeros((3, len(position)))
     stretches: list[tuple[slice, bool]] = []
     fitted_rows = [np.arange(0)]
     # noise within the band of the motion stays
-    share = math.sqrt(min(2.0 * _CUTOFF_RATIO * width * period, 1.0)) if width else 1.0
+    share = math.sqrt(min(2.0 * cutoff * period, 1.0))
     for s in segments:
-        if width:
-            smooth[s] = low_pass(position[s], _CUTOFF_RATIO * width, period)
+        smooth[s] = low_pass(position[s], cutoff, period)
         rate[s] = np.gradient(smooth[s], period)
         turns = _find_reversals(smooth[s], max(_REVERSAL_NOISE * noise * share, 1e-6 * float(np.ptp(position))))
         parts = slices_between([s.start, *(s.start + index + 1 for index in turns), s.stop])
@@ -274,7 +274,7 @@ def _prepare_rig(log: RigLog) -> _Rig | None:
             direction[part] = 1.0 if travel >= 0.0 else -1.0
             stretches.append((part, part.start == s.start))
         # the state of friction is unknown before a complete stretch, direction and rate at reversals
-        guard = max(round(0.5 / (_CUTOFF_RATIO * width * period)) if width else 0, 2)
+        guard = max(round(0.5 / (cutoff * period)), 2)
         settled_parts = parts[2:] if len(parts) > 3 else parts[1:]
         fitted_rows += [np.arange(part.start + guard, part.stop - guard) for part in settled_parts]
     rows = np.concatenate(fitted_rows)

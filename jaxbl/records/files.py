@@ -198,8 +198,7 @@ class LogFile:
             cell, place = np.asarray(cells, dtype=object)[row], f"column {name!r}, data row {rows[row] + 1} is"
             if np.isfinite(values[row]):
                 raise self.error(f"{place} {values[row]:g}; a reading should be below {LARGEST:g}")
-            is_empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
-            fault = "empty or not a number" if is_empty else repr(cell)
+            fault = "empty or not a number" if pd.isna(cell) else repr(cell)
             raise self.error(f"{place} {fault}; it should be a finite number, as 1234.5")
         return values
 
@@ -420,7 +419,7 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
         count = 0
         with chunks:
             for frame in chunks:
-                names = [name if isinstance(name, str) else int(name) for name in frame.columns]
+                names = frame.columns.tolist()
                 texts = [name for name in names if not is_numeric_dtype(frame[name])]
                 if texts and text_format.names is not None:
                     is_header = (frame[texts] == texts).all(axis=1)
@@ -602,17 +601,15 @@ def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) 
     """Name the columns, and interpolate those that have their own times to the times of the first one."""
     columns, times = Columns(), values[0]
     own_times = times
-    for i, column in enumerate(values):
-        name = names[i] if i < len(names) else ""
-        if i == 0 or name == "Name":
+    for i, (name, column) in enumerate(itertools.zip_longest(names, values, fillvalue="")):
+        if i and name == "Name":
             own_times = column
-            if i:
-                continue
-            name = name if name not in ("", "Name") else "t"
-        elif own_times is not times and not np.array_equal(own_times, times, equal_nan=True):
+            continue
+        if not np.array_equal(own_times, times, equal_nan=True):
             column = read_at(times, own_times, column)
             columns.notes.append(f"'{name}' was sampled at other times: it is interpolated to those of the first column.")
-        name = name or f"column {i}"
+        if name in ("", "Name"):
+            name = f"column {i}" if i else "t"
         columns[name] = column
     _note_units(columns, units)
     return columns

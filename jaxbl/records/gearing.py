@@ -103,15 +103,13 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     target, rows, coefficients, errors, skew, has_skew = fit
     # the ratio is that of the whole motion, with the parts that repeat within it
     slopes, slope_errors = _fit_terms(target, rows[:, :4])
-    if not np.isfinite(slopes).all():
-        return None
     residuals, slope = target - rows[:, :4] @ slopes, float(slopes[0])
     spread = float(np.std(target))
     residual = _rms(residuals) / spread if spread else np.inf
     # encoders are not late by many periods, and at a constant speed, to and fro, a delay looks like lost motion
-    correlation = abs(float(rows[:, 1] @ rows[:, 2])) / float(
-        np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300
-    )
+    velocity, flank = rows[:, 1:3].T
+    speed = _rms(velocity)
+    correlation = abs(float(velocity @ flank)) / (len(rows) * speed * _rms(flank))
     has_skew = has_skew and residual < UNRELATED and abs(skew) < 10.0 * period and correlation < 0.97
     # only a significant skew is undone
     undone_skew = skew if has_skew and abs(skew) > 4.0 * errors[1] / abs(coefficients[0]) else 0.0
@@ -132,7 +130,6 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
             2.0 * float(coefficients[2]) * float(np.sign(coefficients[0])), 2.0 * float(errors[2])
         )
     # the crossing of the gap is not modelled: an error of 0.5 % of the gap, by motions of several frequencies
-    speed = _rms(rows[:, 1])
     skew_error = float(np.hypot(errors[1], 0.005 * lost_motion_fit.lost_motion / speed) / abs(coefficients[0]))
     # with a gap as large as the motion a delay cannot be found
     has_skew = has_skew and not is_wide

@@ -103,8 +103,10 @@ def _fit_lateness(
         return None
     lateness, step = 0.0, math.inf
     while True:
-        instants = [period * np.arange(len(torque)) for torque in torques]
-        moved = [interpolate_spline(t, torque, t + lateness) for t, torque in zip(instants, torques, strict=True)]
+        moved = [
+            interpolate_spline(times, torque, times + lateness)
+            for times, torque in zip((grid.time[segment] for segment in segments), torques, strict=True)
+        ]
         slope = np.concatenate([_differentiate(torque, period) for torque in moved])[rows]
         target, regressors = np.concatenate(moved)[rows], np.column_stack([motion[rows], -slope])
         values, errors = fit_with_jackknife(target, regressors)

@@ -90,26 +90,27 @@ def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
     return name, _UNIT_NAMES.get(unit, unit)
 
 
-def _matches(kind: str, name: str) -> bool:
-    """Return True if a name, or a word of it, is usual for a kind of column."""
-    return any(re.fullmatch(_NAME_PATTERNS[kind], word) for word in (name.replace(" ", "_"), *name.split()))
+def _find_kinds(name: str) -> set[str]:
+    """Return the kinds of columns for which a name, or a word of it, is usual."""
+    words = name.replace(" ", "_"), *name.split()
+    return {kind for kind, pattern in _NAME_PATTERNS.items() if any(re.fullmatch(pattern, word) for word in words)}
 
 
-def _guess_channel(name: str, unit: str) -> str:
-    """Guess the channel of a column from its name and unit; "" for none."""
-    side = "s" if _matches("load", name) else "e"
-    if _matches("t", name) or (not name and unit in SECONDS_PER_UNIT):
+def _guess_channel(name: str, unit: str, kinds: set[str]) -> str:
+    """Guess the channel of a column from its name, unit and kinds; "" for none."""
+    side = "s" if "load" in kinds else "e"
+    if "t" in kinds or (not name and unit in SECONDS_PER_UNIT):
         return "t"
     # an unknown unit fits any quantity
     fitting = [kind for kind, units in _CHANNEL_UNITS.items() if unit in units or unit not in _SPELLINGS]
-    if "u" in fitting and (_matches("u", name) or unit in ("N m", "mN m") or (not name and unit in ("mA", "A"))):
+    if "u" in fitting and ("u" in kinds or unit in ("N m", "mN m") or (not name and unit in ("mA", "A"))):
         return "u"
-    if _matches("omega", name) or unit in SPEED_FACTORS:
+    if "omega" in kinds or unit in SPEED_FACTORS:
         return f"omega_{side}" if "omega" in fitting or unit == "counts" else ""
     # motor or load as the only word does not tell the quantity: a temperature is one of the motor, too
     is_bare_side = name in ("motor", "load", "output", "arm", "joint", "link", "secondary") and not unit
-    has_position_unit = unit in POSITION_FACTORS and (not name or _matches("motor", name) or side == "s")
-    is_position = _matches("position", name) and "theta" in fitting
+    has_position_unit = unit in POSITION_FACTORS and (not name or kinds & {"motor", "load"})
+    is_position = "position" in kinds and "theta" in fitting
     return f"theta_{side}" if is_position or is_bare_side or has_position_unit else ""
 
 
@@ -123,13 +124,12 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     candidates: dict[str, list[_Candidate]] = {}
     for column in file.columns:
         name, unit = _split_unit(file, column)
-        channel, is_setpoint = _guess_channel(name, unit), _matches("setpoint", name)
+        kinds = _find_kinds(name)
+        channel = _guess_channel(name, unit, kinds)
         # a commanded torque stands for one that was not measured, a side alone for a position
-        is_second_choice = not _matches("position", name)
-        if channel == "u":
-            is_second_choice = is_setpoint or _matches("load", name) or _matches("supply", name)
+        is_second_choice = bool(kinds & {"setpoint", "load", "supply"}) if channel == "u" else "position" not in kinds
         values = file.load_values(column) if channel else np.zeros(0)
-        if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or not is_setpoint)):
+        if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or "setpoint" not in kinds)):
             candidates.setdefault(channel, []).append(_Candidate(is_second_choice, column, name, unit, values))
     guesses: list[str] = []
     table: _Table = {}
@@ -144,7 +144,7 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         # beside a named position it is how much a servo is loaded
         chosen["u"] = chosen.pop("theta_s")
     for channel, candidate in chosen.items():
-        if channel == "u" and _matches("setpoint", candidate.name):
+        if channel == "u" and "setpoint" in _find_kinds(candidate.name):
             guesses.append(f"u is '{candidate.column}', the commanded torque: no column looks like a measured one.")
         # a measured position is better than the integral of a speed
         if channel.replace("omega", "theta") not in {*chosen} - {channel}:
@@ -181,7 +181,7 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
         moving = {
             column: values.astype(float)
             for column, values in signals.items()
-            if column not in named and not _matches("setpoint", _split_unit(file, column)[0])
+            if column not in named and "setpoint" not in _find_kinds(_split_unit(file, column)[0])
             if values.dtype.kind in "iuf" and not rises_evenly(values) and np.isfinite(values).all() and np.ptp(values)
         }
         channels, period = find_moving_columns(moving, times)

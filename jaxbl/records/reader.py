@@ -425,18 +425,13 @@ def _measure_channel(
     file: LogFile, name: str, raw: RawChannel, segmented: SegmentedStamps, source: Grid
 ) -> ChannelStatistics:
     """Measure a channel, with remarks; noise and bandwidth are those of the longest segment of `source`."""
-    segment = longest_segment(source.segments)
-    values, times = source.values[name][segment], source.time[segment]
-    period = float(times[-1] - times[0]) / (len(values) - 1)
+    values, period = source.values[name][longest_segment(source.segments)], source.period
     readings = np.concatenate([raw.values[rows] for rows in segmented.segments])
     step = find_resolution(readings)
     is_position = name.startswith("theta")
     jumps, saturated = 0, raw.saturated
     if is_position:
-        stamps = None if segmented.sampling.even else segmented.times
-        jumps = sum(
-            count_jumps(raw.values[rows], step, None if stamps is None else stamps[rows]) for rows in segmented.segments
-        )
+        jumps = sum(count_jumps(raw.values[rows], step, segmented.times[rows]) for rows in segmented.segments)
     elif not saturated:
         saturated = saturated_share(readings, step)
     statistics = ChannelStatistics(

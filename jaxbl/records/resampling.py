@@ -103,8 +103,8 @@ def _common_times(
     file: LogFile, stamps: np.ndarray, period: float, delays: Iterable[Delay], first: float | None
 ) -> np.ndarray:
     """Return evenly spaced times at which all channels have values, s; on the grid from `first`, unless it is None."""
-    spans = [stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays]
-    begin, end = max(float(span[0]) for span in spans), min(float(span[1]) for span in spans)
+    begins, ends = np.transpose([stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays])
+    begin, end = float(begins.max()), float(ends.min())
     if first is not None:
         # the samples of channels without skew lie on this grid
         begin = first + period * math.ceil((begin - first) / period - 1e-6)

@@ -317,9 +317,9 @@ def fit_even_stamps(stamps: np.ndarray) -> StampFit:
     period = float(index @ (stamps - middle) / (index @ index))
     deviation = float(np.abs(stamps - middle - period * index).max())
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
-    rounding = find_resolution(np.diff(stamps))
-    # a row or two that were lost or repeated are likelier than a period that is off by as much as their stamps say
     intervals = np.diff(stamps)
+    rounding = find_resolution(intervals)
+    # a row or two that were lost or repeated are likelier than a period that is off by as much as their stamps say
     irregular = np.count_nonzero(np.abs(intervals - np.median(intervals)) > 0.5 * period)
     is_rounded = irregular not in (1, 2) and deviation <= 0.55 * min(rounding, 20.0 * period)
     is_even = period > 0.0 and (deviation <= 0.02 * period or is_rounded)
