@@ -425,7 +425,9 @@ def _measure_channel(
     file: LogFile, name: str, raw: RawChannel, segmented: SegmentedStamps, source: Grid
 ) -> ChannelStatistics:
     """Measure a channel, with remarks; noise and bandwidth are those of the longest segment of `source`."""
-    values, period = source.values[name][longest_segment(source.segments)], source.period
+    segment = longest_segment(source.segments)
+    values, times = source.values[name][segment], source.time[segment]
+    period = float(times[-1] - times[0]) / (len(values) - 1)
     readings = np.concatenate([raw.values[rows] for rows in segmented.segments])
     step = find_resolution(readings)
     is_position = name.startswith("theta")
