@@ -64,19 +64,17 @@ class NominalDrive:
 
 @dataclass(frozen=True)
 class Skew:
-    """Delay of the stamps of theta_s against its readings, compared with theta_e.
+    """Delay of the stamps of theta_s against its readings, compared with theta_e, that only a clock can cause.
 
     Attributes:
         value: s, less the wind-up by the torque in the shaft.
         error: standard error, s.
         max_windup_delay: largest delay that friction can imitate, s: all of the motor's work goes into the load's friction.
-        is_sure: True if only a clock can cause it.
     """
 
     value: float
     error: float
     max_windup_delay: float
-    is_sure: bool
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,8 @@ class Offset:
     is_sure: bool
 
 
-def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
-    """Judge if the skew between both encoders is caused by a clock; None if there is none.
+def find_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
+    """Find the skew between both encoders that only a clock can cause; None if there is none.
 
     Friction of the load winds the shaft up by T / K and so looks like a delay. In the mean over the log the part of T in
     phase with the velocity is at most <u ω> / <ω²> for any law of friction: no passive load takes more work than the
@@ -106,17 +104,17 @@ def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Ske
     max_delay = max_windup_delay(grid, nominal)
     if gearing.skew is None or gearing.skew_error is None or not math.isfinite(max_delay):
         return None
-    size = abs(gearing.skew)
     # friction makes the load lag, never lead
     friction_delay = _NOMINAL_FACTOR * max_delay if gearing.skew > 0.0 else 0.0
-    is_sure = size > friction_delay + _SURE_ERRORS * gearing.skew_error and size > 0.05 * grid.period
-    value, regression = gearing.skew, _regress_twist(grid, nominal, gearing.skew) if is_sure else None
-    if regression is not None:
+    if abs(gearing.skew) <= max(friction_delay + _SURE_ERRORS * gearing.skew_error, 0.05 * grid.period):
+        return None
+    value = gearing.skew
+    if (regression := _regress_twist(grid, nominal, value)) is not None:
         # without the wind-up by the shaft torque, from the motor's equation of motion
         value += float(regression.values[1]) / nominal.gear_ratio
     # friction takes something between nothing and all of it
     value = float(np.clip(value, gearing.skew - max_delay, gearing.skew))
-    return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay, is_sure)
+    return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay)
 
 
 def max_windup_delay(grid: Grid, nominal: NominalDrive) -> float:

@@ -337,7 +337,8 @@ def _read_text(path: Path, start: bytes, encoding: str, is_complete: bool, selec
     _check_lines(path)
     # after a wrong letter, which may be far behind the head, the caller tries another encoding
     with _report_errors("a table", UnicodeDecodeError):
-        return _read_table(path, head, encoding, load_text, selection)
+        lines = head.splitlines()
+        return _read_after_remarks(lines, load_text) or _read_table(path, lines, encoding, selection)
 
 
 def _check_lines(path: Path) -> None:
@@ -389,11 +390,11 @@ _VALUE = re.compile(rf"{_NUMBER.pattern}|.*\d[:-]\d.*", re.IGNORECASE)
 _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
-def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], str], selection: Selection) -> Columns:
-    """Read columns separated by comma, semicolon, tab or white space; a header or none; # before remarks."""
-    lines = head.splitlines()
-    if (columns := _read_after_remarks(lines, load_text)) is not None:
-        return columns
+def _read_table(path: Path, lines: list[str], encoding: str, selection: Selection) -> Columns:
+    """Read columns separated by comma, semicolon, tab or white space; a header or none; # before remarks.
+
+    `lines` are the first ones of the text.
+    """
     text_format, headers = detect_text_format(lines), list[int]()
 
     def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:

@@ -324,7 +324,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     if dynamics is None:
         guesses.append("The log does not show an inertia: 1 is a placeholder.")
     else:
-        inertia, viscous = (float(value) for value in dynamics.values[:2])
+        inertia, viscous = dynamics.values[:2].tolist()
         if inertia < 2.0 * float(dynamics.errors[0]) or inertia <= 0.0:
             # then the inertia takes a small part of the torque
             inertia = 0.1 * dynamics.torque / dynamics.acceleration

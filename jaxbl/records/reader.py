@@ -14,7 +14,7 @@ from jaxbl.lines import DOUBT
 from jaxbl.units import on_a_line
 from jaxbl.validation import check_sizes, explain_first_error
 
-from .alignment import NominalDrive, find_encoder_offset, judge_clock_skew, max_windup_delay
+from .alignment import NominalDrive, find_clock_skew, find_encoder_offset, max_windup_delay
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Drift, Gearing, fit_drift, fit_gearing
@@ -284,8 +284,8 @@ def _resample_and_align(
     if is_estimated:
         skew = _estimate_skew(file, gearing, period)
     elif shaft is not None and gearing is not None:
-        clock_skew = judge_clock_skew(gearing, grid.first(share), shaft)
-        if clock_skew is not None and clock_skew.is_sure:
+        clock_skew = find_clock_skew(gearing, grid.first(share), shaft)
+        if clock_skew is not None:
             skew = clock_skew.value
             place = " in the middle of the log" if sentences else ""
             sentences.append(

@@ -248,8 +248,8 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     if repeated:
         row = rows[int(np.argmin(distinct))] + 1
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
-        times, rows = times[distinct], rows[distinct]
-        pieces, segments = _split_at_intervals(times, stamps.max_interval)
+    times, rows = times[distinct], rows[distinct]
+    pieces, segments = _split_at_intervals(times, stamps.max_interval)
     samples = sum(map(_count_samples, segments))
     if samples < MIN_SAMPLES:
         longest_piece = max(map(_count_samples, pieces))
@@ -275,14 +275,13 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
             f"{lost.sum():.0f} rows are missing, after data row {rows[first] + 1} first; they are interpolated."
         )
     if is_even:
-        times = times.copy()
         for piece, fit in zip(segments, fits, strict=True):
             times[piece] = fit.first + fit.period * np.arange(_count_samples(piece))
         period = fits[segments.index(longest_segment(segments))].period
     sampling = Sampling(
         samples=len(stamps.times),
         median_period=stamps.median_interval,
-        jitter=float(np.std(intervals[within])) if within.any() else 0.0,
+        jitter=float(np.std(intervals[within])),
         longest_interval=float(intervals.max()),
         gaps=len(pieces) - 1,
         repeated=repeated,
