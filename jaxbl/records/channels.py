@@ -311,7 +311,7 @@ def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarr
     jump_rows = np.flatnonzero(steps > 0.75 * span)
     if not len(jump_rows) or len(jump_rows) > 0.1 * len(values):
         return
-    usual_step = float(np.quantile(np.delete(steps, jump_rows), 0.999)) if len(jump_rows) < len(steps) else np.inf
+    usual_step = float(np.quantile(np.delete(steps, jump_rows), 0.999))
     # a turn in each unit, and counters of 3 to 32 bits
     periods = [2.0 * math.pi, 360.0, 1.0, *(2.0**k for k in range(3, 33)), table.counts_per_turn or 360.0]
     # without its jump by a period the motion goes on as before

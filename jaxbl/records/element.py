@@ -312,8 +312,8 @@ class _Model(NamedTuple):
 
     @property
     def is_possible(self) -> bool:
-        """True if stiffness and all sizes are positive."""
-        return bool(self.sizes[0] > 0.0 and (self.sizes[2:] > 0.0).all())
+        """True if stiffness and all sizes but the offset are positive."""
+        return bool((np.delete(self.sizes, 1) > 0.0).all())
 
 
 def _add_terms(rig: _Rig, best: _Model) -> _Model:
