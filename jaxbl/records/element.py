@@ -349,7 +349,7 @@ def _drop_terms(rig: _Rig, model: _Model) -> _Model:
 
 
 def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
-    return _drop_negative_terms(rig, _fit_model(rig, tuple(kept for kept in model.terms if kept != term), model))
+    return _drop_negative_terms(rig, _fit_model(rig, tuple(name for name in model.terms if name != term), model))
 
 
 def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model:

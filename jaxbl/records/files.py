@@ -198,7 +198,8 @@ class LogFile:
             cell, place = np.asarray(cells, dtype=object)[row], f"column {name!r}, data row {rows[row] + 1} is"
             if np.isfinite(values[row]):
                 raise self.error(f"{place} {values[row]:g}; a reading should be below {LARGEST:g}")
-            fault = "empty or not a number" if pd.isna(cell) else repr(cell)
+            is_empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
+            fault = "empty or not a number" if is_empty else repr(cell)
             raise self.error(f"{place} {fault}; it should be a finite number, as 1234.5")
         return values
 

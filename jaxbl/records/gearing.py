@@ -318,13 +318,14 @@ Flanks = Iterator[tuple[np.ndarray, np.ndarray]]
 
 def find_flank(target: np.ndarray, terms: np.ndarray, flanks: Flanks) -> tuple[np.ndarray, np.ndarray] | None:
     """Find the flanks that explain most of a target beside other terms; None if too few samples are clear of the gap."""
-    candidates = []
+    best = None
     for flank, is_clear in flanks:
         sample = np.flatnonzero(is_clear)[:: max(int(is_clear.sum()) // 20_000, 1)]
         if len(sample) >= 3 * terms.shape[1] and is_clear.sum() >= 0.1 * len(is_clear):
-            residual = fit_residual(target[sample], np.column_stack([flank, terms])[sample])
-            candidates.append((rms(residual), flank, is_clear))
-    return min(candidates, key=lambda candidate: candidate[0])[1:] if candidates else None
+            residual = rms(fit_residual(target[sample], np.column_stack([flank[sample], terms[sample]])))
+            if best is None or residual < best[0]:
+                best = residual, flank, is_clear
+    return None if best is None else best[1:]
 
 
 def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics | None) -> float:
