@@ -4,13 +4,14 @@ A skew or an offset is sure if neither friction, gap nor load torque can cause i
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from .gearing import Gearing
-from .least_squares import fit_with_jackknife, residual_mean_square, rms
+from .gearing import Flanks, Gearing, find_flank
+from .least_squares import fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
     find_bandwidth,
@@ -26,8 +27,8 @@ _SURE_ERRORS = 6.0
 """Standard errors from which on an estimate is sure: errors from 12 blocks are themselves known to 20 %."""
 _NOMINAL_FACTOR = 3.0
 """Factor by which a stiffness, friction or gap of a data sheet may be wrong."""
-_MIN_HARMONIC_RESIDUAL = 0.5
-"""Share of the residual mean square that remains with harmonics of one to three periods a turn, if the log has none."""
+_MIN_HARMONIC_RESIDUAL = 0.5**0.5
+"""Share of the residual rms that remains with harmonics of one to three periods a turn, if the log has none."""
 _MIN_TORQUE_SHARE = 0.1
 """Share of the input torque that an offset has to cause in the nominal shaft, to be reported."""
 
@@ -63,19 +64,17 @@ class NominalDrive:
 
 @dataclass(frozen=True)
 class Skew:
-    """Delay of the stamps of theta_s against its readings, compared with theta_e.
+    """Delay of the stamps of theta_s against its readings, compared with theta_e, that only a clock can cause.
 
     Attributes:
         value: s, less the wind-up by the torque in the shaft.
         error: standard error, s.
         max_windup_delay: largest delay that friction can imitate, s: all of the motor's work goes into the load's friction.
-        is_sure: True if only a clock can cause it.
     """
 
     value: float
     error: float
     max_windup_delay: float
-    is_sure: bool
 
 
 @dataclass(frozen=True)
@@ -95,29 +94,27 @@ class Offset:
     is_sure: bool
 
 
-def judge_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
-    """Judge if the skew between both encoders is caused by a clock; None if there is none.
+def find_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew | None:
+    """Find the skew between both encoders that only a clock can cause; None if there is none.
 
     Friction of the load winds the shaft up by T / K and so looks like a delay. In the mean over the log the part of T in
     phase with the velocity is at most <u ω> / <ω²> for any law of friction: no passive load takes more work than the
     motor gives.
     """
-    if gearing.skew is None or gearing.skew_error is None or "u" not in grid.values:
-        return None
     max_delay = max_windup_delay(grid, nominal)
-    if not math.isfinite(max_delay):
+    if gearing.skew is None or gearing.skew_error is None or not math.isfinite(max_delay):
         return None
-    size = abs(gearing.skew)
     # friction makes the load lag, never lead
     friction_delay = _NOMINAL_FACTOR * max_delay if gearing.skew > 0.0 else 0.0
-    is_sure = size > friction_delay + _SURE_ERRORS * gearing.skew_error and size > 0.05 * grid.period
-    value, regression = gearing.skew, _regress_twist(grid, nominal, gearing.skew) if is_sure else None
-    if regression is not None:
+    if abs(gearing.skew) <= max(friction_delay + _SURE_ERRORS * gearing.skew_error, 0.05 * grid.period):
+        return None
+    value = gearing.skew
+    if (regression := _regress_twist(grid, nominal, value)) is not None:
         # without the wind-up by the shaft torque, from the motor's equation of motion
-        value += float(regression.values[2]) / nominal.gear_ratio
+        value += float(regression.values[1]) / nominal.gear_ratio
     # friction takes something between nothing and all of it
     value = float(np.clip(value, gearing.skew - max_delay, gearing.skew))
-    return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay, is_sure)
+    return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay)
 
 
 def max_windup_delay(grid: Grid, nominal: NominalDrive) -> float:
@@ -139,53 +136,45 @@ def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
     regression = _regress_twist(grid, nominal)
     if regression is None:
         return None
-    values, errors, torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration = regression[:7]
-    value = float(values[0])
+    torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration = regression.motion
+    value, sure_size = float(regression.values[0]), _SURE_ERRORS * float(regression.errors[0])
     terms = [np.ones(len(torque)), motor_velocity, motor_acceleration, np.sign(motor_velocity)]
     bias, bias_error = (float(x[0]) for x in fit_with_jackknife(torque, np.column_stack(terms)))
     constant = max(abs(float(np.mean(torque))), abs(bias) + 2.0 * bias_error if np.isfinite(bias) else np.inf)
     # a constant torque, or a constant error of u, looks like an offset of that torque over the stiffness
-    error = float(np.hypot(errors[0], constant / nominal.stiffness))
+    windup = constant / nominal.stiffness
     load_torque = nominal.load_inertia * load_acceleration + nominal.load_viscous * load_velocity
-    has_both_flanks = regression.has_both_flanks and constant < float(
-        np.quantile(np.abs(load_torque / nominal.gear_ratio), 0.9)
+    has_both_flanks = (
+        regression.has_both_flanks
+        and constant < float(np.quantile(np.abs(load_torque / nominal.gear_ratio), 0.9))
+        # the twist has to cover the gap, which is up to a third narrower than a data sheet says
+        and regression.twist_range > 1.5 * nominal.half_gap
     )
-    # the twist has to cover the gap, which is up to a third narrower than a data sheet says
-    has_both_flanks = has_both_flanks and regression.twist_range > 1.5 * nominal.half_gap
     gap_share = 0.0 if has_both_flanks else _NOMINAL_FACTOR * nominal.half_gap
-    torque_rms = rms(torque)
-    if nominal.stiffness * (abs(value) - gap_share) < _MIN_TORQUE_SHARE * torque_rms or abs(
-        value
-    ) - gap_share < _SURE_ERRORS * float(errors[0]):
+    if abs(value) - gap_share < max(sure_size, _MIN_TORQUE_SHARE * rms(torque) / nominal.stiffness):
         return None
     # the constant torque, or a stiffness that is half as large again, may explain all of it
-    if abs(value) < (1.0 if has_both_flanks else 0.5) * constant / nominal.stiffness:
+    if abs(value) < (1.0 if has_both_flanks else 0.5) * windup:
         return None
-    is_sure = (
-        has_both_flanks and abs(value) > _SURE_ERRORS * float(errors[0]) + _NOMINAL_FACTOR * constant / nominal.stiffness
-    )
-    return Offset(value, error, has_both_flanks, is_sure)
+    is_sure = has_both_flanks and abs(value) > sure_size + _NOMINAL_FACTOR * windup
+    return Offset(value, float(np.hypot(regression.errors[0], windup)), has_both_flanks, is_sure)
 
 
 class _Regression(NamedTuple):
-    """Regression of the twist, less the nominal wind-up, on 1, flank, load velocity and acceleration.
+    """Regression of the twist, less the nominal wind-up, on 1, load velocity and acceleration, and flank if there are both.
 
     Errors that repeat with the load's turn are regressed along if they improve the fit much.
 
     Attributes:
-        values, errors: coefficients of 1, flank, velocity, acceleration; 0 for the flank if there is only one.
-        torque, load_velocity, load_acceleration, motor_velocity, motor_acceleration: low-passed, shape (samples,).
+        values, errors: coefficients of 1, velocity, acceleration and others.
+        motion: torque, velocity and acceleration of the load and of the motor, low-passed, shape (samples,) each.
         has_both_flanks: True if torque, velocity or acceleration of both signs occur.
         twist_range: of the twist without the wind-up, without a hundredth at each end, rad (m).
     """
 
     values: np.ndarray
     errors: np.ndarray
-    torque: np.ndarray
-    load_velocity: np.ndarray
-    load_acceleration: np.ndarray
-    motor_velocity: np.ndarray
-    motor_acceleration: np.ndarray
+    motion: Sequence[np.ndarray]
     has_both_flanks: bool
     twist_range: float
 
@@ -201,39 +190,33 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     for s in segments:
         moved = interpolate_spline(grid.time[s], load[s], grid.time[s] + skew) if skew else load[s]
         motor_motion, load_motion = (low_pass_motion(x, cutoff, grid.period) for x in (motor[s], moved))
-        torque = low_pass(grid.values["u"][s], cutoff, grid.period)
-        inner = trim_filter_ends(len(torque), cutoff, grid.period)
-        parts.append(np.stack([torque, *motor_motion, *load_motion], axis=1)[inner])
-    torque, motor_place, motor_velocity, motor_acceleration, place, velocity, acceleration = np.concatenate(parts).T
+        signals = np.stack([low_pass(grid.values["u"][s], cutoff, grid.period), *motor_motion, *load_motion])
+        parts.append(signals[:, trim_filter_ends(len(moved), cutoff, grid.period)])
+    torque, motor_place, motor_velocity, motor_acceleration, place, velocity, acceleration = np.concatenate(parts, axis=1)
     twist = motor_place - nominal.gear_ratio * place
     shaft_torque = torque - nominal.motor_inertia * motor_acceleration - nominal.motor_viscous * motor_velocity
     target = twist - shaft_torque / nominal.stiffness
-    constant = np.ones(len(target))
-    best = None
-    for flank in (shaft_torque, velocity, acceleration):
-        is_clear = np.abs(flank) > 0.3 * rms(flank)
-        share = float(np.mean(flank[is_clear] > 0.0)) if is_clear.any() else 0.0
-        if is_clear.sum() < 0.25 * len(is_clear) or not 0.05 < share < 0.95:
-            continue
-        rows = np.column_stack([constant, np.sign(flank), velocity, acceleration])[is_clear]
-        mean_square = residual_mean_square(target[is_clear], rows)
-        if best is None or mean_square < best[0]:
-            best = (mean_square, is_clear, rows)
-    flanks = best is not None
-    if best is None:
-        rows = np.column_stack([constant, velocity, acceleration])
-        best = (residual_mean_square(target, rows), constant > 0.0, rows)
-    mean_square, is_clear, rows = best
+    twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
+    terms = np.column_stack([np.ones(len(target)), velocity, acceleration])
+
+    def list_flanks() -> Flanks:
+        for flank in (shaft_torque, velocity, acceleration):
+            is_clear = np.abs(flank) > 0.3 * rms(flank)
+            share = np.mean(flank[is_clear] > 0.0) if is_clear.any() else 0.0
+            if is_clear.sum() >= 0.25 * len(is_clear) and 0.05 < share < 0.95:
+                yield np.sign(flank), is_clear
+
+    best = find_flank(target, terms, list_flanks())
+    rows = terms
+    if best is not None:
+        flank, is_clear = best
+        target, rows, place = target[is_clear], np.column_stack([terms, flank])[is_clear], place[is_clear]
     # over a part of a turn the eccentricity of an encoder or wheel has a mean, too
-    harmonics = [wave(n * place[is_clear]) for n in (1, 2, 3) for wave in (np.sin, np.cos)]
-    with_harmonics = np.column_stack([rows, *harmonics])
-    if residual_mean_square(target[is_clear], with_harmonics) < _MIN_HARMONIC_RESIDUAL * mean_square:
+    with_harmonics = np.column_stack([rows, *(wave(n * place) for n in (1, 2, 3) for wave in (np.sin, np.cos))])
+    if rms(fit_residual(target, with_harmonics)) < _MIN_HARMONIC_RESIDUAL * rms(fit_residual(target, rows)):
         rows = with_harmonics
-    values, errors = fit_with_jackknife(target[is_clear], rows)
+    values, errors = fit_with_jackknife(target, rows)
     if not np.isfinite(values).all():
         return None
-    if not flanks:
-        values, errors = np.insert(values, 1, 0.0), np.insert(errors, 1, 0.0)
-    twist_range = float(np.ptp(np.quantile(target, (0.01, 0.99))))
     motion = torque, velocity, acceleration, motor_velocity, motor_acceleration
-    return _Regression(values, errors, *motion, flanks, twist_range)
+    return _Regression(values, errors, motion, best is not None, twist_range)

@@ -10,7 +10,7 @@ from jaxbl.validation import suggest_word
 from .files import LogFile
 from .libraries import ColumnName
 from .signal_quality import find_resolution, find_runs
-from .table import POSITION_CHANNELS, SPEED_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
+from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
 _LEAST_MOTION, _LEAST_TORQUE = 1e-12, 1e-15
@@ -23,16 +23,16 @@ class RawChannel(NamedTuple):
     Attributes:
         values: shape (rows,).
         unit: rad, m, N m or N.
-        saturated: share of rows at the saturation level that `[log]` gives.
         skew: delay of the stamps against the values, s; "estimate": to be estimated.
+        saturated: share of rows at the saturation level that `[log]` gives.
         hold: `[log] hold` of a torque that acts on the drive; None for what is only measured.
         drift: growth of the skew, s/s.
     """
 
     values: np.ndarray
     unit: str
-    saturated: float
     skew: float | str
+    saturated: float = 0.0
     hold: Literal["zoh", "sampled"] | None = None
     drift: float = 0.0
 
@@ -44,22 +44,19 @@ def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[st
         InputError: a column is missing, or its values contradict the `[log]` table.
     """
     channels: dict[str, RawChannel] = {}
-    is_linear = False
     for name in POSITION_CHANNELS.values():
-        speed = getattr(table, SPEED_CHANNELS[name])
-        if speed is not None:
-            is_linear |= speed.si_unit == "m" and not channels
-            channels[name] = _integrate_speed(file, name, speed, stamps)
+        channel, source = table.position_source(name)
+        if isinstance(source, SpeedTable):
+            channels[name] = _integrate_speed(file, name, channel, source, stamps)
         elif _is_recorded(file, table, name):
-            position = getattr(table, name) or PositionTable()
-            is_linear |= position.si_unit == "m" and not channels
-            channels[name] = _read_position(file, name, position, stamps)
+            channels[name] = _read_position(file, name, source, stamps)
     if not channels:
         columns = ", ".join(map(str, file.columns))
         raise file.error(
             f"no column 'theta_e' or 'theta_s'; columns: {columns}; [log] theta_e can name the motor position, "
             "omega_e its speed"
         )
+    is_linear = next(iter(channels.values())).unit == "m"
     torques = {"u": table.u or TorqueTable()} if _is_recorded(file, table, "u") else {}
     if table.transmitted is not None:
         torques["transmitted"] = table.transmitted
@@ -94,9 +91,14 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
 
 
 def _read_numbers(
-    file: LogFile, name: str, column: ColumnName, table: PositionTable | SpeedTable | TorqueTable, stamps: TimeStamps
+    file: LogFile,
+    name: str,
+    table: PositionTable | SpeedTable | TorqueTable,
+    stamps: TimeStamps,
+    other_column: ColumnName | None = None,
 ) -> np.ndarray:
-    """Read the numbers of a column at the selected rows; words become signed numbers."""
+    """Read the numbers of a channel's column, or of another one, at the selected rows; words become signed numbers."""
+    column = table.column_or(name) if other_column is None else other_column
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
     values = file.load_numbers(column, f"{name}.column", stamps.rows)
     signed_words = decode_words(table, values)
@@ -123,13 +125,12 @@ def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.nda
 
 def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
     """Convert signed and unwrapped numbers of a column to SI units by its `[log]` table: rad (m), rad/s (m/s), N m (N)."""
-    if isinstance(table, TorqueTable):
-        unit_factor, factor = 1.0, 1.0 if table.factor is None else table.factor
-    elif isinstance(table, SpeedTable):
-        unit_factor, factor = SPEED_FACTORS[table.unit], table.factor
-    else:
-        unit_factor, factor = POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0), table.factor
-    return table.sign * factor * unit_factor * values + (table.offset or 0.0)
+    factor = table.factor or 1.0
+    if isinstance(table, SpeedTable):
+        factor *= SPEED_FACTORS[table.unit]
+    elif isinstance(table, PositionTable):
+        factor *= POSITION_FACTORS[table.unit] / (table.counts_per_turn or 1.0)
+    return table.sign * factor * values + (table.offset or 0.0)
 
 
 POSITION_FACTORS = {
@@ -143,13 +144,13 @@ SPEED_FACTORS = {
 
 
 def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeStamps) -> RawChannel:
-    column = table.column_or(name)
-    values = _read_numbers(file, name, column, table, stamps)
+    values = _read_numbers(file, name, table, stamps)
     if table.minus is not None:
-        values = values - _read_numbers(file, name, table.minus, table, stamps)
+        values = values - _read_numbers(file, name, table, stamps, table.minus)
     if np.ptp(values) == 0.0:
         raise file.error(
-            f'column {column!r} ({name}) is {values[0]:g} in all rows; it should move; absent = ["{name}"] leaves it out'
+            f"column {table.column_or(name)!r} ({name}) is {values[0]:g} in all rows; it should move; "
+            f'absent = ["{name}"] leaves it out'
         )
     if table.wrap is None:
         _check_wrap(file, name, table, values, stamps)
@@ -162,37 +163,36 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
     values = to_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
         raise file.error(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
-    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0, drift=table.drift or 0.0)
+    return RawChannel(values, table.si_unit, table.skew or 0.0, drift=table.drift or 0.0)
 
 
 def _read_reference(file: LogFile, table: PositionTable, stamps: TimeStamps) -> RawChannel:
     """Read what a controller was given: it may stand still or jump."""
-    values = _read_numbers(file, "reference", table.column_or("reference"), table, stamps)
+    values = _read_numbers(file, "reference", table, stamps)
     values = to_si(table, values if table.wrap is None else _unwrap(file, "reference", table, values))
-    return RawChannel(values, table.si_unit, 0.0, table.skew or 0.0)
+    return RawChannel(values, table.si_unit, table.skew or 0.0)
 
 
-def _integrate_speed(file: LogFile, name: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
+def _integrate_speed(file: LogFile, name: str, channel: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
     """Integrate a speed to a position by the trapezoidal rule, 0 at the first row."""
-    channel = SPEED_CHANNELS[name]
-    column = table.column_or(channel)
-    values = _read_numbers(file, channel, column, table, stamps)
+    from scipy.integrate import cumulative_trapezoid
+
+    values = _read_numbers(file, channel, table, stamps)
     if np.ptp(values) == 0.0:
-        raise file.error(f"column {column!r} ({channel}) is {values[0]:g} in all rows; it should change")
+        raise file.error(f"column {table.column_or(channel)!r} ({channel}) is {values[0]:g} in all rows; it should change")
     step = find_resolution(values)
-    speed = to_si(table, values)
-    position = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(stamps.times))])
+    position = cumulative_trapezoid(to_si(table, values), stamps.times, initial=0.0)
     step_text = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
     file.warnings.append(
         f"{name} is the integral of the speed {channel}{step_text}: its errors add up over time. Even a complete model "
         "may leave more than noise, and effects that depend on the load's position are found only roughly."
     )
-    return RawChannel(position, table.si_unit, 0.0, table.skew or 0.0)
+    return RawChannel(position, table.si_unit, table.skew or 0.0)
 
 
 def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamps, *, is_linear: bool) -> RawChannel:
     column = table.column_or(name)
-    values = _read_numbers(file, name, column, table, stamps)
+    values = _read_numbers(file, name, table, stamps)
     if is_linear and table.unit == "N m":
         raise file.error(f"[log] {name}.unit is N m, but the position is in m; on a linear axis it should be N")
     if table.signed_bits is None and table.sign_bit is None:
@@ -215,7 +215,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     largest = np.abs(values).max()
     if 0.0 < largest < _LEAST_TORQUE:
         raise file.error(f"{name} is at most {largest:.3g}; see its unit and factor in [log]")
-    return RawChannel(values, "N" if is_linear else "N m", saturated, table.skew or 0.0)
+    return RawChannel(values, "N" if is_linear else "N m", table.skew or 0.0, saturated)
 
 
 _MAX_DROPOUT = 3
@@ -241,15 +241,13 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
         middle = 0.5 * (beside[1] + beside[2])
         bend = np.abs(2.0 * beside[[1, 2]] - beside[[0, 3]] - middle).max(axis=0)
         is_clear = np.abs(middle - filler) > _CLEAR_JUMP * bend
-        dropped = [np.arange(*pair) for pair in zip(starts[is_clear], stops[is_clear], strict=True)]
         # levels of a stepping or random input look like dropouts now and then
-        if len(dropped) < max(3.0, 0.5 * len(starts)) or len(dropped) > _MAX_DROPOUT_SHARE * len(values):
+        if not max(3.0, 0.5 * len(starts)) <= is_clear.sum() <= _MAX_DROPOUT_SHARE * len(values):
             continue
-        rows = np.concatenate(dropped)
-        is_kept = np.ones(len(values), bool)
-        is_kept[rows] = False
+        rows = np.concatenate([np.arange(*run) for run in zip(starts[is_clear], stops[is_clear], strict=True)])
+        kept_times, kept_values = np.delete(stamps.times, rows), np.delete(values, rows)
         values = values.copy()
-        values[rows] = np.interp(stamps.times[rows], stamps.times[is_kept], values[is_kept])
+        values[rows] = np.interp(stamps.times[rows], kept_times, kept_values)
         file.warnings.append(
             f"{name} is {filler:g} in {len(rows)} samples between others that are far from it (data row "
             f"{stamps.rows[rows[0]] + 1} first): dropouts, which were left out."
@@ -313,7 +311,7 @@ def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarr
     jump_rows = np.flatnonzero(steps > 0.75 * span)
     if not len(jump_rows) or len(jump_rows) > 0.1 * len(values):
         return
-    usual_step = float(np.quantile(np.delete(steps, jump_rows), 0.999)) if len(jump_rows) < len(steps) else np.inf
+    usual_step = float(np.quantile(np.delete(steps, jump_rows), 0.999))
     # a turn in each unit, and counters of 3 to 32 bits
     periods = [2.0 * math.pi, 360.0, 1.0, *(2.0**k for k in range(3, 33)), table.counts_per_turn or 360.0]
     # without its jump by a period the motion goes on as before
@@ -354,13 +352,13 @@ def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarr
     if table.factor != 1.0 or table.unit not in ("rad", "deg") or not step:
         return
     column = f"column {table.column_or(name)!r} ({name})"
-    turn_by_unit = {"rad": 2.0 * math.pi, "deg": 360.0}
-    other = "deg" if table.unit == "rad" else "rad"
-    unit_names = {"rad": "radians", "deg": "degrees"}
-    if _is_encoder_count(turn_by_unit[other] / step) and not _is_encoder_count(turn_by_unit[table.unit] / step):
+    units = {"rad": (2.0 * math.pi / step, "radians"), "deg": (360.0 / step, "degrees")}
+    counts, unit_name = units.pop(table.unit)
+    other, (other_counts, other_name) = units.popitem()
+    if _is_encoder_count(other_counts) and not _is_encoder_count(counts):
         raise file.error(
-            f"{column} has steps of {step:.6g}, a turn of {round(turn_by_unit[other] / step)} counts in {unit_names[other]}:"
-            f' it is not in {unit_names[table.unit]}; set unit = "{other}" in [log] {name}'
+            f"{column} has steps of {step:.6g}, a turn of {round(other_counts)} counts in {other_name}: it is not in "
+            f'{unit_name}; set unit = "{other}" in [log] {name}'
         )
     if table.unit == "rad" and math.isclose(step, 1.0, rel_tol=1e-9) and len(np.unique(values)) > 16:
         raise file.error(
@@ -371,7 +369,5 @@ def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarr
 
 def _is_encoder_count(counts: float) -> bool:
     """Return True if the counts a turn are a power of two, as with absolute and interpolated encoders."""
-    if not 2.0**6 <= counts <= 2.0**27:
-        return False
     power = math.log2(counts)
-    return abs(power - round(power)) < 1e-4
+    return 6.0 <= power <= 27.0 and abs(power - round(power)) < 1e-4

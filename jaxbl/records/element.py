@@ -24,8 +24,8 @@ import numpy as np
 from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
-from .least_squares import BLOCKS, BlockRegression, column_rms, fit_with_jackknife, rms
-from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass
+from .least_squares import BlockRegression, column_rms, fit_residual, fit_with_jackknife, rms, student_interval
+from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass, slices_between
 
 _MAX_SAMPLES = 20_000
 """Samples that are fitted; of longer logs, means. A few hundred describe a loop of torque over displacement."""
@@ -45,12 +45,15 @@ _MAX_RELATIVE_ERROR = 0.5
 """Relative standard error from which on a number counts as open; as in `jaxbl identify`."""
 _REVERSAL_NOISE = 6.0
 """Rms noises of the displacement that a reversal has to exceed: white noise over the length of a log does not."""
-_HALF_GAP_STARTS = 0.02, 0.1, 0.3, 0.5, 0.7
-"""Half gaps at which searches start, over half the range of the displacement."""
-_CENTRE_STARTS = -0.5, -0.2, 0.0, 0.2, 0.5
-"""Centres of the gap at which searches start, from the middle of the range, over half of it."""
-_LENGTH_STARTS = 0.02, 0.06, 0.2, 0.6
-"""Lengths of the hysteresis, and windups of a slipping transmission, at which searches start, over half the range."""
+_SHAPE_STARTS = {
+    "centre": (-0.5, -0.2, 0.0, 0.2, 0.5),
+    "half_gap": (0.02, 0.1, 0.3, 0.5, 0.7),
+    "length": (0.02, 0.06, 0.2, 0.6),
+    "windup": (0.02, 0.06, 0.2, 0.6),
+}
+"""Nonlinear number -> where searches start, over half the range of the displacement; the centre from the middle of it."""
+_SHAPE_BOUNDS = {"centre": (-1.0, 1.0), "half_gap": (0.0, 1.0), "length": (1e-4, 10.0), "windup": (1e-4, 1.0)}
+"""Bounds of the search, likewise."""
 _SERIES = "gap", "slip"
 """Terms of play, spring and slip in series."""
 
@@ -136,8 +139,7 @@ class _Rig:
         rate: slope of the low-passed displacement, shape (samples,).
         blur: displacement within a sample, and by noise, rad (m), shape (samples,).
         direction: of motion, +1 or -1, shape (samples,).
-        stretches: samples between reversals, in order, of all segments.
-        begins: for each stretch, True if it is the first one of its segment.
+        stretches: samples between reversals, in order, of all segments, each with True if it is the first of its segment.
         rows: samples that are fitted, after the first reversals of their segment.
         torque: N m (N), shape (samples,).
     """
@@ -146,14 +148,13 @@ class _Rig:
     rate: np.ndarray
     blur: np.ndarray
     direction: np.ndarray
-    stretches: list[slice]
-    begins: list[bool]
+    stretches: list[tuple[slice, bool]]
     rows: np.ndarray
     torque: np.ndarray
 
     @property
     def half_range(self) -> float:
-        return 0.5 * (float(self.position.max()) - float(self.position.min()))
+        return 0.5 * float(np.ptp(self.position))
 
     @property
     def fitted_torque(self) -> np.ndarray:
@@ -191,7 +192,7 @@ class _Rig:
     def _drag(self, reach: float) -> np.ndarray:
         """Return where the position has dragged what follows it at a distance of at most `reach`, shape (samples,)."""
         dragged, last = np.zeros(len(self.position)), 0.0
-        for part, begins in zip(self.stretches, self.begins, strict=True):
+        for part, begins in self.stretches:
             forward = float(self.direction[part.start])
             # how it was wound up before is unknown: not at all errs least
             last = self.position[part.start] if begins else last
@@ -203,12 +204,11 @@ class _Rig:
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
         h, last = np.zeros(len(deflection)), 0.0
-        for part, begins in zip(self.stretches, self.begins, strict=True):
+        for part, begins in self.stretches:
             forward = float(self.direction[part.start])
-            start = 0.0 if begins else last
-            before = deflection[part.start] if begins else deflection[part.start - 1]
+            before = deflection[part.start - (not begins)]
             way = np.maximum(forward * (deflection[part] - before), 0.0) / length
-            w = forward * start
+            w = 0.0 if begins else forward * last
             rise = np.tanh(np.maximum(way + min(w, 0.0), 0.0))
             base = max(w, 0.0)
             h[part] = forward * np.where(w + way < 0.0, w + way, (base + rise) / (1.0 + base * rise))
@@ -244,49 +244,44 @@ def _average_samples(log: RigLog) -> RigLog:
     count = min(math.ceil(len(position) / _MAX_SAMPLES), int(1.0 / (_SAMPLES_PER_PERIOD * width * period)))
     if count < 2:
         return log
-    parts, ends, mean_count = [], [], 0
+    parts = []
     for s in segments:
-        segment_means = (s.stop - s.start) // count
-        if segment_means < _MIN_MEANS:
-            continue
-        samples = np.stack([position[s], torque[s]])[:, : segment_means * count]
-        parts.append(samples.reshape(2, segment_means, count).mean(axis=2))
-        ends.append(slice(mean_count, mean_count + segment_means))
-        mean_count += segment_means
-    means = np.concatenate(parts, axis=1)
-    return RigLog(means[0], means[1], ends, count * period, noise / math.sqrt(count))
+        mean_count = (s.stop - s.start) // count
+        if mean_count >= _MIN_MEANS:
+            samples = np.stack([position[s], torque[s]])[:, : mean_count * count]
+            parts.append(samples.reshape(2, mean_count, count).mean(axis=2))
+    ends = itertools.accumulate((part.shape[1] for part in parts), initial=0)
+    position, torque = np.concatenate(parts, axis=1)
+    return RigLog(position, torque, slices_between(ends), count * period, noise / math.sqrt(count))
 
 
 def _prepare_rig(log: RigLog) -> _Rig | None:
     position, torque, segments, period, noise = log
     width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
-    smooth, rate, direction = position.copy(), np.zeros(len(position)), np.zeros(len(position))
-    stretches: list[slice] = []
-    begins: list[bool] = []
-    fitted_rows = []
+    cutoff = _CUTOFF_RATIO * width or math.inf
+    smooth, rate, direction = np.zeros((3, len(position)))
+    stretches: list[tuple[slice, bool]] = []
+    fitted_rows = [np.arange(0)]
     # noise within the band of the motion stays
-    share = math.sqrt(min(2.0 * _CUTOFF_RATIO * width * period, 1.0)) if width else 1.0
+    share = math.sqrt(min(2.0 * cutoff * period, 1.0))
     for s in segments:
-        if width:
-            smooth[s] = low_pass(position[s], _CUTOFF_RATIO * width, period)
+        smooth[s] = low_pass(position[s], cutoff, period)
         rate[s] = np.gradient(smooth[s], period)
         turns = _find_reversals(smooth[s], max(_REVERSAL_NOISE * noise * share, 1e-6 * float(np.ptp(position))))
-        ends = [0, *(index + 1 for index in turns), s.stop - s.start]
-        parts = [slice(s.start + a, s.start + b) for a, b in itertools.pairwise(ends) if b > a]
-        for i, part in enumerate(parts):
+        parts = slices_between([s.start, *(s.start + index + 1 for index in turns), s.stop])
+        for part in parts:
             travel = smooth[part.stop - 1] - smooth[max(part.start - 1, s.start)]
             direction[part] = 1.0 if travel >= 0.0 else -1.0
-            stretches.append(part)
-            begins.append(i == 0)
+            stretches.append((part, part.start == s.start))
         # the state of friction is unknown before a complete stretch, direction and rate at reversals
-        guard = max(round(0.5 / (_CUTOFF_RATIO * width * period)) if width else 0, 2)
+        guard = max(round(0.5 / (cutoff * period)), 2)
         settled_parts = parts[2:] if len(parts) > 3 else parts[1:]
         fitted_rows += [np.arange(part.start + guard, part.stop - guard) for part in settled_parts]
-    rows = np.concatenate([*fitted_rows, np.arange(0)])
+    rows = np.concatenate(fitted_rows)
     if len(rows) < MIN_SAMPLES or np.ptp(torque[rows]) == 0.0 or np.ptp(smooth[rows]) == 0.0:
         return None
     blur = np.abs(rate) * period + 4.0 * noise + 1e-9 * float(np.ptp(smooth))
-    return _Rig(position, rate, blur, direction, stretches, begins, rows, torque)
+    return _Rig(position, rate, blur, direction, stretches, rows, torque)
 
 
 def _find_reversals(values: np.ndarray, least: float) -> list[int]:
@@ -317,8 +312,8 @@ class _Model(NamedTuple):
 
     @property
     def is_possible(self) -> bool:
-        """True if stiffness and all sizes are positive."""
-        return bool(self.sizes[0] > 0.0 and (self.sizes[2:] > 0.0).all())
+        """True if stiffness and all sizes but the offset are positive."""
+        return bool((np.delete(self.sizes, 1) > 0.0).all())
 
 
 def _add_terms(rig: _Rig, best: _Model) -> _Model:
@@ -329,15 +324,13 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
             for term in TERMS
             if term not in best.terms
         ]
-        candidates = [
-            (model, gain) for model in models if model.is_possible and (gain := _compute_gain(rig, best, model)) is not None
-        ]
+        gains = [(_compute_gain(rig, best, model) if model.is_possible else None, model) for model in models]
+        candidates = [(len(model.shapes), -gain, model) for gain, model in gains if gain is not None]
         if not candidates:
             return best
         # of two that are equally good, the one with fewer numbers
-        candidates.sort(key=lambda candidate: (len(candidate[0].shapes), -candidate[1]))
-        best = candidates[0][0]
-        for model, _ in candidates[1:]:
+        (*_, best), *further = sorted(candidates, key=lambda candidate: candidate[:2])
+        for *_, model in further:
             if _compute_gain(rig, best, model) is not None:
                 best = model
 
@@ -345,30 +338,26 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
 def _drop_terms(rig: _Rig, model: _Model) -> _Model:
     """Drop terms that do not lower the error clearly, those with the smallest gain first."""
     while True:
-        reduced_models = [_fit_without(rig, model, term) for term in model.terms]
         sufficient_models = [
-            reduced_model
-            for reduced_model in reduced_models
-            if reduced_model.sizes[0] > 0.0 and _compute_gain(rig, reduced_model, model) is None
+            reduced
+            for term in model.terms
+            if (reduced := _fit_without(rig, model, term)).sizes[0] > 0.0 and _compute_gain(rig, reduced, model) is None
         ]
         if not sufficient_models:
             return model
-        model = min(sufficient_models, key=lambda reduced_model: float(np.mean(_held_out_errors(rig, reduced_model))))
+        model = min(sufficient_models, key=lambda reduced: np.mean(_held_out_errors(rig, reduced)))
 
 
 def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
-    return _drop_negative_terms(
-        rig, _fit_model(rig, tuple(kept_term for kept_term in model.terms if kept_term != term), model)
-    )
+    return _drop_negative_terms(rig, _fit_model(rig, tuple(name for name in model.terms if name != term), model))
 
 
 def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model:
     """Drop terms with a negative size; if `new_term` is among them, return the model unchanged."""
     while True:
-        sized_terms = [term for term in model.terms if term in SIZE_NAMES]
-        positive_terms = {term for term, size in zip(sized_terms, model.sizes[2:], strict=True) if size > 0.0}
-        terms = tuple(term for term in model.terms if term not in SIZE_NAMES or term in positive_terms)
-        if terms == model.terms or (new_term in SIZE_NAMES and new_term not in positive_terms):
+        sizes = dict(zip((term for term in model.terms if term in SIZE_NAMES), model.sizes[2:], strict=True))
+        terms = tuple(term for term in model.terms if sizes.get(term, 1.0) > 0.0)
+        if terms == model.terms or not sizes.get(new_term, 1.0) > 0.0:
             return model
         model = _fit_model(rig, terms, model)
 
@@ -379,11 +368,6 @@ def _shape_names(terms: Sequence[str]) -> list[str]:
     return [name for name in names if name != "centre" or "slip" not in terms]
 
 
-def _fit_sizes(columns: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    scale = column_rms(columns) + 1e-300
-    return np.linalg.lstsq(columns / scale, torque, rcond=1e-10)[0] / scale
-
-
 def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) -> _Model:
     """Fit a model by least squares. The search starts at the shapes of `near`; other shapes start at the best of a grid."""
     from scipy.optimize import least_squares
@@ -391,29 +375,27 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     names = _shape_names(terms)
     half, middle = rig.half_range, 0.5 * (float(rig.position.min()) + float(rig.position.max()))
     near_shapes = dict(zip(_shape_names(near.terms), near.shapes, strict=True)) if near is not None else {}
-    choices = {
-        "centre": ([middle + half * start for start in _CENTRE_STARTS], middle - half, middle + half),
-        "half_gap": ([half * start for start in _HALF_GAP_STARTS], 0.0, half),
-        "length": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, 10.0 * half),
-        "windup": ([half * start for start in _LENGTH_STARTS], 1e-4 * half, half),
-    }
+
+    def scale_shapes(name: str, shares: tuple[float, ...]) -> list[float]:
+        return [half * share + (middle if name == "centre" else 0.0) for share in shares]
 
     def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
-        columns = rig.compute_columns(terms, shapes)
-        return rig.fitted_torque - columns @ _fit_sizes(columns, rig.fitted_torque)
+        return fit_residual(rig.fitted_torque, rig.compute_columns(terms, shapes))
 
     shapes = np.empty(0)
     if names:
-        low, high = np.array([choices[name][1:] for name in names]).T
+        low, high = np.array([scale_shapes(name, _SHAPE_BOUNDS[name]) for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
-        starts = itertools.product(*([near_shapes[name]] if name in near_shapes else choices[name][0] for name in names))
-        starts = sorted(starts, key=lambda start: float(np.mean(compute_residual(np.array(start), few) ** 2)))[:3]
+        choices = ([near_shapes[name]] if name in near_shapes else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
+        starts = sorted(map(np.array, itertools.product(*choices)), key=lambda start: rms(compute_residual(start, few)))
         inside = low + 1e-9 * half, high - 1e-9 * half
-        solutions = [search(np.clip(np.array(start), *inside), args=(few,)) for start in starts]
+        solutions = [search(np.clip(start, *inside), args=(few,)) for start in starts[:3]]
         best = min(solutions, key=lambda solution: solution.cost)
         shapes = search(best.x, args=(rig,)).x
-    return _Model(terms, shapes, _fit_sizes(rig.compute_columns(terms, shapes), rig.fitted_torque))
+    columns = rig.compute_columns(terms, shapes)
+    scale = column_rms(columns) + 1e-300
+    return _Model(terms, shapes, np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale)
 
 
 def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
@@ -436,8 +418,6 @@ def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
 
 def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, float], linear: bool) -> Element:
     """Compute the numbers, with errors by a jackknife over blocks: these hold for errors of any correlation in time."""
-    from scipy.special import stdtrit
-
     names = [
         "stiffness",
         "offset",
@@ -460,14 +440,13 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         jacobian[:, place] /= stiffness
         values[place] *= stiffness
     _, errors = fit_with_jackknife(residual + jacobian @ values, jacobian)
-    quantile = float(stdtrit(BLOCKS - 1, 0.975))
     numbers, open_ = {}, []
     for name, value, error in zip(names, values.tolist(), errors.tolist(), strict=True):
         if name == "friction_coefficient":
             # fitted as its product with the stiffness
             error = math.hypot(error / model.sizes[0], value * errors[0] / model.sizes[0] ** 2)
             value = value / float(model.sizes[0])
-        low, high = value - quantile * error, value + quantile * error
+        low, high = student_interval(value, error)
         if name not in ("offset", "centre"):
             low = max(low, 0.0)
             if not error < _MAX_RELATIVE_ERROR * abs(value):
@@ -476,7 +455,7 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
         numbers[name] = Quantity(value, error, (low, high), unit)
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_torque(model)
-    reversals = len(rig.stretches) - sum(rig.begins)
+    reversals = sum(not begins for _, begins in rig.stretches)
     return Element(
         numbers, tuple(open_), gains, model.terms, torque, *rig.compute_error(model), reversals, model.shapes, model.sizes
     )

@@ -8,6 +8,7 @@ Only the selected columns stay in memory; any other is loaded when it is used.
 
 import csv
 import io
+import itertools
 import json
 import math
 import re
@@ -234,12 +235,11 @@ def read_log_file(path: Path, selection: Selection = ()) -> LogFile:
             columns = _read_columns(path, selection)
         except IsADirectoryError:
             raise InputError("is a folder; a log file is needed") from None
-        if not all(str(name).isprintable() for name in columns):
-            printable_columns = {
-                escape_unprintable(name) if isinstance(name, str) else name: values for name, values in columns.items()
-            }
-            columns.clear()
-            columns.update(printable_columns)
+        printable_columns = {
+            escape_unprintable(name) if isinstance(name, str) else name: values for name, values in columns.items()
+        }
+        columns.clear()
+        columns.update(printable_columns)
         return LogFile(path, columns)
 
 
@@ -338,7 +338,8 @@ def _read_text(path: Path, start: bytes, encoding: str, is_complete: bool, selec
     _check_lines(path)
     # after a wrong letter, which may be far behind the head, the caller tries another encoding
     with _report_errors("a table", UnicodeDecodeError):
-        return _read_table(path, head, encoding, load_text, selection)
+        lines = head.splitlines()
+        return _read_after_remarks(lines, load_text) or _read_table(path, lines, encoding, selection)
 
 
 def _check_lines(path: Path) -> None:
@@ -390,18 +391,25 @@ _VALUE = re.compile(rf"{_NUMBER.pattern}|.*\d[:-]\d.*", re.IGNORECASE)
 _NO_ROWS = "has a header and no rows; a log needs rows of numbers"
 
 
-def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], str], selection: Selection) -> Columns:
-    """Read columns separated by comma, semicolon, tab or white space; a header or none; # before remarks."""
-    lines = head.splitlines()
-    if (columns := _read_after_remarks(lines, load_text)) is not None:
-        return columns
+def _read_table(path: Path, lines: list[str], encoding: str, selection: Selection) -> Columns:
+    """Read columns separated by comma, semicolon, tab or white space; a header or none; # before remarks.
+
+    `lines` are the first ones of the text.
+    """
     text_format, headers = detect_text_format(lines), list[int]()
 
     def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:
         """Return the names of all columns, the values of the selected ones, and the number of rows."""
         chunks: Any = pd.read_csv(
             path,
-            **text_format.pandas_options(),
+            sep=text_format.separator,
+            header=None,
+            names=text_format.names,
+            comment="#",
+            skipinitialspace=True,
+            decimal=text_format.decimal,
+            thousands=text_format.thousands,
+            index_col=False,
             skiprows=text_format.first_row,
             low_memory=False,
             encoding=encoding,
@@ -413,7 +421,7 @@ def _read_table(path: Path, head: str, encoding: str, load_text: Callable[[], st
         count = 0
         with chunks:
             for frame in chunks:
-                names = [name if isinstance(name, str) else int(name) for name in frame.columns]
+                names = frame.columns.tolist()
                 texts = [name for name in names if not is_numeric_dtype(frame[name])]
                 if texts and text_format.names is not None:
                     is_header = (frame[texts] == texts).all(axis=1)
@@ -474,19 +482,6 @@ class TextFormat(NamedTuple):
     count: int
     first_row: int
     units: Sequence[str] = ()
-
-    def pandas_options(self) -> Any:
-        """Return the keywords for `pandas.read_csv`."""
-        return {
-            "sep": self.separator,
-            "header": None,
-            "names": self.names,
-            "comment": "#",
-            "skipinitialspace": True,
-            "decimal": self.decimal,
-            "thousands": self.thousands,
-            "index_col": False,
-        }
 
     def parse_row(self, line: str) -> list[float] | None:
         """Parse a row into numbers, NaN for a cell that is none; None if there are more cells or fewer."""
@@ -575,20 +570,12 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
     The last lines of the block hold names and, below them, units; TwinCAT writes Name over each column of times.
     `lines` are the first ones of the text.
     """
-    start = next(
-        (
-            i
-            for i in range(min(len(lines) - 2, _MAX_REMARK_LINES))
-            if _is_number_row(lines[i]) and _is_number_row(lines[i + 1])
-        ),
-        0,
-    )
+    pairs = itertools.pairwise(lines[:-1][: _MAX_REMARK_LINES + 1])
+    start = next((i for i, pair in enumerate(pairs) if all(map(_is_number_row, pair))), 0)
     remarks = [line for line in lines[:start] if has_cells(line)]
     if len(remarks) < 2:
         return None
     separator = _find_separator(lines[start : start + 1])
-    if separator == _WHITE_SPACE:
-        return None
     count = len(_split_cells(lines[start], separator))
     is_known_program = any(title in line for line in remarks for title in ("EPOS Studio", "Starttime of export"))
     titles = [_split_cells(line, separator) for line in remarks]
@@ -600,12 +587,7 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
     frame = pd.read_csv(io.StringIO("\n".join(rows)), header=None, skipinitialspace=True, index_col=False, **signs)
     titles = [cells[:count] for cells in titles if len(cells) >= count]
     scope_names = [cells for cells in titles if cells[0] == "Name"]
-    if scope_names:
-        names, units = scope_names[-1], []
-    elif len(titles) > 1:
-        names, units = titles[-2:]
-    else:
-        names, units = titles[-1] if titles else [], []
+    names, units, *_ = [*(scope_names[-1:] or titles[-2:]), [], []]
     return _name_columns([frame[i].to_numpy() for i in range(count)], names, units)
 
 
@@ -621,17 +603,15 @@ def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) 
     """Name the columns, and interpolate those that have their own times to the times of the first one."""
     columns, times = Columns(), values[0]
     own_times = times
-    for i, column in enumerate(values):
-        name = names[i] if i < len(names) else ""
-        if i == 0 or name == "Name":
+    for i, (name, column) in enumerate(itertools.zip_longest(names, values, fillvalue="")):
+        if i and name == "Name":
             own_times = column
-            if i:
-                continue
-            name = name if name not in ("", "Name") else "t"
-        elif own_times is not times and not np.array_equal(own_times, times, equal_nan=True):
+            continue
+        if not np.array_equal(own_times, times, equal_nan=True):
             column = read_at(times, own_times, column)
             columns.notes.append(f"'{name}' was sampled at other times: it is interpolated to those of the first column.")
-        name = name or f"column {i}"
+        if name in ("", "Name"):
+            name = f"column {i}" if i else "t"
         columns[name] = column
     _note_units(columns, units)
     return columns
@@ -710,7 +690,7 @@ def _add_columns(columns: Columns, name: str, value: Any) -> None:
     if not isinstance(value, dict):
         value = np.squeeze(np.asarray(value))
         if "s2" in (value.dtype.names or ()):
-            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({value['s2'].item().decode()})")
+            columns.unread[_MATLAB_OBJECTS].append(f"{name} ({value['s2'].item().decode()})")
             return
         if value.dtype.names and not value.ndim:
             value = {field: value[field] for field in value.dtype.names}
@@ -750,7 +730,7 @@ def _read_matlab(path: Path, selection: Selection) -> Columns:
         elif re.fullmatch(r"double|single|logical|u?int\d+", kind):
             _add_vectors(columns, name, shape, partial(load_variable, name))
         elif kind != "char":
-            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({kind})")
+            columns.unread[_MATLAB_OBJECTS].append(f"{name} ({kind})")
     # a message that lists columns has to know their names
     for name in postponed if not any(column in columns for column in selection) else ():
         _add_columns(columns, name, load_variable(name))
@@ -813,7 +793,7 @@ def _read_hdf5(path: Path) -> Columns:
             if isinstance(link, h5py.HardLink):
                 add_dataset(member, node[place])
             else:
-                columns.unread.setdefault(_LINKS, []).append(member)
+                columns.unread[_LINKS].append(member)
 
         return node.visititems_links(add_member)
 
@@ -823,9 +803,9 @@ def _read_hdf5(path: Path) -> Columns:
             return
         matlab_class = node.attrs.get("MATLAB_class", b"").decode()
         if node.is_virtual or node.external:
-            columns.unread.setdefault(_LINKS, []).append(name)
+            columns.unread[_LINKS].append(name)
         elif "MATLAB_object_decode" in node.attrs:
-            columns.unread.setdefault(_MATLAB_OBJECTS, []).append(f"{name} ({matlab_class})")
+            columns.unread[_MATLAB_OBJECTS].append(f"{name} ({matlab_class})")
         elif node.dtype.kind in "biuf" and matlab_class != "char":
             _add_vectors(columns, name, node.shape, partial(load_dataset, node.name))
         # cells, and structures with several elements; they may hold one another

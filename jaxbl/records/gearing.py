@@ -1,15 +1,12 @@
 """Relation of motor and load position: ratio, skew, lost motion."""
 
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .least_squares import (
-    BlockRegression,
-    fit_with_jackknife,
-    residual_mean_square,
-    rms,
-)
+from .least_squares import BlockRegression, fit_residual, fit_with_jackknife, rms
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
 from .resampling import Grid
 from .rigid_body import smooth_sign
@@ -31,8 +28,8 @@ UNRELATED = 0.2
 """Share of the motor's motion that the load's motion does not explain, from which on the two count as unrelated."""
 WIDE_TWIST = 0.25
 """Twist over the motor's motion, from which on the load follows the motor only loosely."""
-_FLANK_ANGLES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0])
-"""Angles of the mixtures of velocity and acceleration, each over its rms, whose sign may be that of the torque."""
+_FLANK_MIXTURES = np.array([(np.cos(angle), np.sin(angle)) for angle in np.radians(range(0, 91, 15))])
+"""Mixtures of velocity and acceleration, each over its rms, whose sign may be that of the torque."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,7 @@ def _count_decimals(error: float) -> int:
     return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
 
-def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float | None = None) -> Gearing | None:
+def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math.inf) -> Gearing | None:
     """Regress motor on load position, its velocity, acceleration and flank; None if the motion is too small.
 
     A delay of the load's stamps adds a part to theta_e that is proportional to the velocity; lost motion adds a part with
@@ -94,8 +91,8 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float | None
     at the load winds up the shaft in proportion to velocity, too, and cannot be separated from a delay. Errors of encoders
     and gear that repeat with position (eccentricity) are removed by a cosine series over the range of theta_s.
 
-    Lost motion is found with the `expected` ratio, if there is one. Gear and encoders repeat after a `turn` of the load;
-    None on a linear axis.
+    Lost motion is found with the `expected` ratio, if there is one. Gear and encoders repeat after a `turn` of the load,
+    which is infinite on a linear axis.
     """
     period, motor, load = grid.period, grid.values["theta_e"], grid.values["theta_s"]
     part, usable = longest_segment(grid.segments), long_segments(grid.segments)
@@ -106,15 +103,13 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float | None
     target, rows, coefficients, errors, skew, has_skew = fit
     # the ratio is that of the whole motion, with the parts that repeat within it
     slopes, slope_errors = _fit_terms(target, rows[:, :4])
-    if not np.isfinite(slopes).all():
-        return None
     residuals, slope = target - rows[:, :4] @ slopes, float(slopes[0])
     spread = float(np.std(target))
     residual = _rms(residuals) / spread if spread else np.inf
     # encoders are not late by many periods, and at a constant speed, to and fro, a delay looks like lost motion
-    correlation = abs(float(rows[:, 1] @ rows[:, 2])) / float(
-        np.linalg.norm(rows[:, 1]) * np.linalg.norm(rows[:, 2]) + 1e-300
-    )
+    velocity, flank = rows[:, 1:3].T
+    speed = _rms(velocity)
+    correlation = abs(float(velocity @ flank)) / (len(rows) * speed * _rms(flank))
     has_skew = has_skew and residual < UNRELATED and abs(skew) < 10.0 * period and correlation < 0.97
     # only a significant skew is undone
     undone_skew = skew if has_skew and abs(skew) > 4.0 * errors[1] / abs(coefficients[0]) else 0.0
@@ -135,7 +130,6 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float | None
             2.0 * float(coefficients[2]) * float(np.sign(coefficients[0])), 2.0 * float(errors[2])
         )
     # the crossing of the gap is not modelled: an error of 0.5 % of the gap, by motions of several frequencies
-    speed = _rms(rows[:, 1])
     skew_error = float(np.hypot(errors[1], 0.005 * lost_motion_fit.lost_motion / speed) / abs(coefficients[0]))
     # with a gap as large as the motion a delay cannot be found
     has_skew = has_skew and not is_wide
@@ -182,13 +176,11 @@ class Drift:
     Attributes:
         value: s/s.
         error: standard error.
-        skew: in the middle of the log, s.
         reach: change of the skew over half of the log, s.
     """
 
     value: float
     error: float
-    skew: float
     reach: float
 
 
@@ -197,37 +189,38 @@ _FOLDS = 10
 
 
 def fit_drift(grid: Grid, skew: float) -> Drift | None:
-    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`."""
+    """Fit a drift of the load's stamps; None if it predicts parts left out of the log no better than the constant `skew`.
+
+    The log is one that :func:`fit_gearing` can fit.
+    """
     period = grid.period
     width = _velocity_bandwidth(grid.values["theta_s"][longest_segment(grid.segments)], period)
-    if not width or not long_segments(grid.segments):
-        return None
     constant = _regress_motor(grid, 4.0 * width, skew)
-    drift, fit, error = 0.0, None, np.inf
+    drift, fit, error, reach = 0.0, None, np.inf, 0.0
     half = 0.5 * float(grid.time[-1] - grid.time[0])
     # converges quadratically, as the skew does
     for _ in range(6):
         fit = _regress_motor(grid, 4.0 * width, skew, drift)
         if fit is None or constant is None:
             return None
-        values, errors = fit[2], fit[3]
-        steps = float(values[1] / values[0]), float(values[-1] / values[0])
-        skew, drift, error = skew + steps[0], drift + steps[1], float(errors[-1] / abs(values[0]))
-        if not np.isfinite(drift) or abs(drift) * half > 0.5 / width:
+        *_, values, errors = fit
+        step, drift_step, error = (float(x / values[0]) for x in (values[1], values[-1], errors[-1]))
+        skew, drift = skew + step, drift + drift_step
+        reach = abs(drift) * half
+        if not reach <= 0.5 / width:
             return None
-        if abs(steps[0]) + abs(steps[1]) * half < 1e-3 * period:
+        if abs(step) + abs(drift_step) * half < 1e-3 * period:
             break
     assert fit is not None and constant is not None
     # of what a fit leaves, since squares of a position hide those of its errors
     before, after = (
-        BlockRegression.of(target - rows @ np.nan_to_num(values), rows, _FOLDS).held_out()
-        for target, rows, values, *_ in (constant, fit)
+        BlockRegression.of(target - rows @ values, rows, _FOLDS).held_out() for target, rows, values, _ in (constant, fit)
     )
     gains = np.log(before / after)
     better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
-    if not better or abs(drift) < 6.0 * error or abs(drift) * half < 0.05 * period:
+    if not better or abs(drift) < 6.0 * abs(error) or reach < 0.05 * period:
         return None
-    return Drift(drift, error, skew, abs(drift) * half)
+    return Drift(drift, abs(error), reach)
 
 
 def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
@@ -250,7 +243,7 @@ def _fit_terms(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _fit_lost_motion(
-    grid: Grid, aligned: list[np.ndarray], cutoff: float, ratio: float, turn: float | None, *, is_wide: bool
+    grid: Grid, aligned: list[np.ndarray], cutoff: float, ratio: float, turn: float, *, is_wide: bool
 ) -> LostMotion | None:
     """Fit the lost motion by the direction of motion, or by changes of the sign of the load torque.
 
@@ -261,39 +254,33 @@ def _fit_lost_motion(
 
     period, parts = grid.period, []
     for s, load in zip(long_segments(grid.segments), aligned, strict=True):
-        cut = trim_filter_ends(len(load), cutoff, period)
         motion = low_pass_motion(load, cutoff, period)
-        parts.append(np.stack([grid.time[s], grid.values["theta_e"][s] - ratio * load, *motion], axis=1)[cut])
-    time, twist, position, velocity, acceleration = np.concatenate(parts).T
-    ends = np.cumsum([len(part) for part in parts])[:-1]
+        signals = np.stack([grid.time[s], grid.values["theta_e"][s] - ratio * load, *motion])
+        parts.append(signals[:, trim_filter_ends(len(load), cutoff, period)])
+    time, twist, position, velocity, acceleration = np.concatenate(parts, axis=1)
+    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
     rows = [np.ones_like(position), velocity, acceleration]
     if not is_wide:
-        low, span = float(position.min()), float(np.ptp(position))
-        repeats = turn is not None and span > 1.5 * turn
-        place = (position - low) * (2.0 * np.pi / turn if repeats and turn else np.pi / span)
-        rows += [position - low, *(np.cos(k * place) for k in range(1, HARMONICS + 1))]
-        rows += [np.sin(k * place) for k in range(1, HARMONICS + 1)] if repeats else []
-    terms = np.stack(rows, axis=1)
-    sizes = _rms(velocity), _rms(acceleration)
+        way, span = position - position.min(), float(np.ptp(position))
+        repeats = span > 1.5 * turn
+        phases = _count_phases(way * (2.0 * np.pi / turn if repeats else np.pi / span))
+        rows += [way, np.cos(phases), *([np.sin(phases)] if repeats else [])]
+    terms = np.column_stack(rows)
     # the filter reacts to a corner of the motion within this time
     guard = round(0.5 / (cutoff * period))
-    best = None
-    for angle in _FLANK_ANGLES:
-        flank = _flank_signal(angle, velocity, acceleration, sizes)
-        is_clear = np.abs(flank) > 0.3
-        if is_clear.sum() < 0.25 * len(is_clear):
-            continue
-        for part in np.split(np.arange(len(is_clear)), ends):
-            is_clear[part] = minimum_filter1d(is_clear[part], 2 * guard + 1, mode="nearest")
-        sample = np.flatnonzero(is_clear)[:: max(int(is_clear.sum()) // 20_000, 1)]
-        if len(sample) < 3 * terms.shape[1] or is_clear.sum() < 0.1 * len(is_clear):
-            continue
-        mean_square = residual_mean_square(twist[sample], np.column_stack([np.sign(flank[sample]), terms[sample]]))
-        if best is None or mean_square < best[0]:
-            best = (mean_square, flank, is_clear)
+
+    def list_flanks() -> Flanks:
+        for mixture in _FLANK_MIXTURES / (_rms(velocity), _rms(acceleration)):
+            flank = mixture @ (velocity, acceleration)
+            pieces = np.split(np.abs(flank) > 0.3, ends)
+            if sum(map(np.sum, pieces)) >= 0.25 * len(flank):
+                clear_pieces = [minimum_filter1d(piece, 2 * guard + 1, mode="nearest") for piece in pieces]
+                yield np.sign(flank), np.concatenate(clear_pieces)
+
+    best = find_flank(twist, terms, list_flanks())
     if best is None:
         return None if is_wide else fit_lost_motion_by_load(time, twist, position, velocity, turn)
-    _, flank, is_clear = best
+    flank, is_clear = best
     fit = fit_lost_motion_by_direction(twist, terms, flank, is_clear)
     if is_wide:
         # the wind-up of the shaft is part of this shift, and its share is unknown in so few cycles
@@ -320,9 +307,25 @@ def _rms(values: np.ndarray) -> float:
     return rms(values) + 1e-300
 
 
-def _flank_signal(angle: float, velocity: np.ndarray, acceleration: np.ndarray, sizes: tuple[float, float]) -> np.ndarray:
-    """Return the mixture of velocity and acceleration at one of :data:`_FLANK_ANGLES`; `sizes` are the rms of both."""
-    return np.cos(angle) * velocity / sizes[0] + np.sin(angle) * acceleration / sizes[1]
+def _count_phases(place: np.ndarray) -> np.ndarray:
+    """Return the phases, rad, of all harmonics at a phase of the first one, shape (samples, HARMONICS)."""
+    return np.outer(place, np.arange(1, HARMONICS + 1))
+
+
+Flanks = Iterator[tuple[np.ndarray, np.ndarray]]
+"""Pairs of a column that tells the flank and whether one is surely in contact, shape (samples,) each."""
+
+
+def find_flank(target: np.ndarray, terms: np.ndarray, flanks: Flanks) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find the flanks that explain most of a target beside other terms; None if too few samples are clear of the gap."""
+    best = None
+    for flank, is_clear in flanks:
+        sample = np.flatnonzero(is_clear)[:: max(int(is_clear.sum()) // 20_000, 1)]
+        if len(sample) >= 3 * terms.shape[1] and is_clear.sum() >= 0.1 * len(is_clear):
+            residual = rms(fit_residual(target[sample], np.column_stack([flank[sample], terms[sample]])))
+            if best is None or residual < best[0]:
+                best = residual, flank, is_clear
+    return None if best is None else best[1:]
 
 
 def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics | None) -> float:
@@ -343,47 +346,37 @@ def _regress_motor(
     """
     period, load = grid.period, grid.values["theta_s"]
     middle = 0.5 * float(grid.time[0] + grid.time[-1])
-    parts, smooth_motor, offsets = [], [], []
+    parts = []
     for s in long_segments(grid.segments):
-        times = grid.time[s]
-        offsets.append(times - middle)
-        late = skew + (drift or 0.0) * offsets[-1]
-        smooth = low_pass(interpolate_spline(times, load[s], times + late), cutoff, period)
-        velocity = np.gradient(smooth, times)
-        parts.append(np.stack([smooth, velocity, np.gradient(velocity, times)]))
-        smooth_motor.append(low_pass(grid.values["theta_e"][s], cutoff, period))
-    inner = [trim_filter_ends(len(signal), cutoff, period) for signal in smooth_motor]
+        times, offset = grid.time[s], grid.time[s] - middle
+        moved = interpolate_spline(times, load[s], times + skew + (drift or 0.0) * offset)
+        motor = low_pass(grid.values["theta_e"][s], cutoff, period)
+        parts.append(np.stack([motor, offset, *low_pass_motion(moved, cutoff, period)]))
 
-    def join_segments(signals: list[np.ndarray]) -> np.ndarray:
-        return np.concatenate([signal[..., cut] for signal, cut in zip(signals, inner, strict=True)], axis=-1)
+    def join_segments(signals: Iterable[np.ndarray]) -> np.ndarray:
+        """Join signals of the segments, samples last, without the ends of each."""
+        inner = [signal[..., trim_filter_ends(signal.shape[-1], cutoff, period)] for signal in signals]
+        return np.concatenate(inner, axis=-1)
 
-    target = join_segments(smooth_motor)
-    position, velocity, acceleration = join_segments(parts)
-    sizes = _rms(velocity), _rms(acceleration)
-    lowest = float(load.min())
-    place = np.pi * (position - lowest) / (float(load.max()) - lowest)
-    series = [np.cos(k * place) for k in range(1, HARMONICS + 1)]
-    rows = np.stack(
-        [position - lowest, velocity, np.zeros_like(position), np.ones_like(position), acceleration, *series], axis=1
-    )
-    best = None
-    for angle in _FLANK_ANGLES:
-        mixed = [_flank_signal(angle, velocity, acceleration, sizes) for _, velocity, acceleration in parts]
-        # between the flanks the twist may have any value in the gap
-        is_clear = np.abs(join_segments(mixed)) > 0.3
-        sample = np.flatnonzero(is_clear)[:: max(len(position) // 20_000, 1)]
-        if len(sample) < 3 * rows.shape[1] or is_clear.sum() < 0.25 * len(is_clear):
-            continue
-        flank = rows[:, 2] = join_segments([low_pass(smooth_sign(m), cutoff, period) for m in mixed])
-        mean_square = residual_mean_square(target[sample], rows[sample])
-        if best is None or mean_square < best[0]:
-            best = (mean_square, flank, is_clear)
+    target, offset, position, velocity, acceleration = join_segments(parts)
+    way = position - load.min()
+    series = np.cos(_count_phases(np.pi * way / np.ptp(load)))
+    rows = np.column_stack([way, velocity, np.ones_like(way), acceleration, series])
+
+    def list_flanks() -> Flanks:
+        for mixture in _FLANK_MIXTURES / (_rms(velocity), _rms(acceleration)):
+            mixed = [mixture @ part[3:] for part in parts]
+            # between the flanks the twist may have any value in the gap
+            is_clear = np.abs(join_segments(mixed)) > 0.3
+            if is_clear.sum() >= 0.25 * len(is_clear):
+                yield join_segments(low_pass(smooth_sign(m), cutoff, period) for m in mixed), is_clear
+
+    best = find_flank(target, rows, list_flanks())
     if best is None:
         return None
-    rows[:, 2] = best[1]
-    if drift is not None:
-        rows = np.column_stack([rows, velocity * join_segments(offsets)])
-    rows, target = rows[best[2]], target[best[2]]
+    flank, is_clear = best
+    drifting = [] if drift is None else [velocity * offset]
+    rows, target = np.column_stack([rows[:, :2], flank, rows[:, 2:], *drifting])[is_clear], target[is_clear]
     coefficients, errors = _fit_terms(target, rows)
     if not np.isfinite(coefficients).all() or coefficients[0] == 0.0:
         return None

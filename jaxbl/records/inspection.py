@@ -68,17 +68,13 @@ class Inspection:
                 f"As read: displacement over {displacement:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
                 f"{record.statistics.channels['u'].unit}. If the rig is another, see the units in [log]."
             )
-        top_speed = float(np.quantile(np.abs(compute_velocity(record)), 0.999))
+        top_speed = np.quantile(np.abs(compute_velocity(record)), 0.999)
         sizes = [f"{side} up to " + (f"{top_speed * 30.0 / math.pi:.3g} rpm" if is_rotary else f"{top_speed:.3g} m/s")]
         if record.torque is not None and np.ptp(record.torque):
             sizes.append(f"u up to {np.abs(record.torque).max():.3g} {record.statistics.channels['u'].unit}")
-            rigid_fit = record.statistics.dynamics
-            if (
-                rigid_fit is not None
-                and 0.0 < 4.0 * rigid_fit.errors[0] < rigid_fit.values[0]
-                and rigid_fit.inflation[0] < 10.0
-            ):
-                sizes.append(f"inertia about {rigid_fit.values[0]:.2g} {'kg m²' if is_rotary else 'kg'}")
+            fit = record.statistics.dynamics
+            if fit is not None and 0.0 < 4.0 * fit.errors[0] < fit.values[0] and fit.inflation[0] < 10.0:
+                sizes.append(f"inertia about {fit.values[0]:.2g} {'kg m²' if is_rotary else 'kg'}")
         return f"As read: {', '.join(sizes)}. If the machine is another, see the units in [log]."
 
     @property
@@ -93,7 +89,6 @@ class Inspection:
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `inspection.json`."""
         record, statistics = self.record, self.record.statistics
-        dynamics = statistics.dynamics
         return {
             "file": str(record.path.resolve()),
             "samples": len(record.time),
@@ -101,11 +96,9 @@ class Inspection:
             "start": record.start,
             "closed_loop": record.closed_loop,
             "segments": [[float(record.time[s][0]), float(record.time[s][-1])] for s in record.segments],
-            "sampling": asdict(statistics.sampling),
-            "channels": {name: asdict(channel) for name, channel in statistics.channels.items()},
             "gear_ratio": self.gear_ratio,
-            "gearing": None if statistics.gearing is None else asdict(statistics.gearing),
-            "dynamics": None if dynamics is None else dynamics.to_dict(),
+            **asdict(statistics),
+            "dynamics": None if statistics.dynamics is None else statistics.dynamics.to_dict(),
             "reversals": self.reversals,
             "element": None if self.element is None else self.element.to_dict(),
             "identifiable": [
@@ -127,22 +120,18 @@ def inspect(
     """Read a measured log and judge what it can identify; arguments and errors are those of :func:`read_record`."""
     table = read_log_table(log)
     record = read_record(path, table, gear_ratio=gear_ratio, nominal=nominal)
+    has_both_sides, gearing = len(record.positions) == 2, record.statistics.gearing
     if table.kind == "element":
-        ratio = None if len(record.positions) < 2 else gear_ratio or 1.0
+        ratio = gear_ratio or 1.0 if has_both_sides else None
         element = fit_record_element(record, ratio)
-        return Inspection(
-            record, table, ratio, 0 if element is None else element.reversals, _judge_element(element), element
-        )
-    gearing = record.statistics.gearing
-    ratio = gear_ratio if gear_ratio is not None else None if gearing is None else gearing.ratio
-    if len(record.positions) < 2:
+        reversals = 0 if element is None else element.reversals
+        return Inspection(record, table, ratio, reversals, tuple(_judge_element(element)), element)
+    ratio = gear_ratio if gearing is None or gear_ratio is not None else gearing.ratio
+    if not has_both_sides:
         ratio = None
     speed = compute_velocity(record)
     reversals = _count_reversals(record, speed)
-    rigid = _judge_rigid_drive(record, speed, reversals)
-    if gearing is not None and gearing.is_loose:
-        rigid = [_weaken_for_loose_load(judgement) for judgement in rigid]
-    judgements = [*rigid, *_judge_transmission(record, speed, reversals, ratio)]
+    judgements = _judge_rigid_drive(record, speed, reversals) + _judge_transmission(record, speed, reversals, ratio)
     return Inspection(record, table, ratio, reversals, tuple(judgements))
 
 
@@ -173,22 +162,19 @@ _ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap", "slip": "slip"}
 """Quantity of an element -> name of its number."""
 
 
-def _judge_element(element: Element | None) -> tuple[Identifiability, ...]:
+def _judge_element(element: Element | None) -> list[Identifiability]:
     if element is None:
         reason = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
-        return tuple(Identifiability(quantity, "no", reason) for quantity in _ELEMENT_NUMBERS)
+        return _judge_alike(_ELEMENT_NUMBERS, "no", reason)
     judgements = []
     for quantity, key in _ELEMENT_NUMBERS.items():
-        number = element.numbers.get(key)
-        if number is None:
-            judgements.append(
-                Identifiability(quantity, "no", "does not predict the torque better on parts of the log that are left out")
-            )
-            continue
-        low, high = number.ends()
-        text = f"{key} = {number}, 95 %: {low:.4g} to {high:.4g}"
-        judgements.append(Identifiability(quantity, "weak" if key in element.open else "yes", text))
-    return tuple(judgements)
+        answer: _Answer = "no"
+        reason = "does not predict the torque better on parts of the log that are left out"
+        if (number := element.numbers.get(key)) is not None:
+            low, high = number.ends()
+            answer, reason = "weak" if key in element.open else "yes", f"{key} = {number}, 95 %: {low:.4g} to {high:.4g}"
+        judgements.append(Identifiability(quantity, answer, reason))
+    return judgements
 
 
 def main_side(record: Record) -> str:
@@ -199,11 +185,9 @@ def main_side(record: Record) -> str:
 def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Differentiate the low-passed position of a side, by default the main one; rad/s (m/s), shape (samples,)."""
     side = side or main_side(record)
-    width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
-    speed = np.zeros(len(record.time))
-    for s in record.segments:
-        _, speed[s], _ = low_pass_motion(record.positions[side][s], 4.0 * width or math.inf, record.sample_period)
-    return speed
+    cutoff = 4.0 * record.statistics.channels[POSITION_CHANNELS[side]].bandwidth or math.inf
+    places = [record.positions[side][segment] for segment in record.segments]
+    return np.concatenate([low_pass_motion(place, cutoff, record.sample_period)[1] for place in places])
 
 
 def _is_moving(speed: np.ndarray) -> np.ndarray:
@@ -233,46 +217,44 @@ def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> lis
     slow, fast = np.quantile(np.abs(moving), [0.05, 0.95])
     minor_share = min((moving > 0).mean(), (moving < 0).mean())
     width = record.statistics.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
-    percent = [f"{100 * share:.0f} % of the torque" for share in rigid_fit.shares]
-    relative_errors = [
-        abs(error / value) if value else math.inf for value, error in zip(rigid_fit.values, rigid_fit.errors, strict=True)
-    ]
 
     def judge(name: str, i: int, evidence: str, similar_term: str) -> Identifiability:
-        weakness = ""
-        if rigid_fit.inflation[i] > 10.0:
-            weakness = f"hard to separate from {similar_term} here (variance × {rigid_fit.inflation[i]:.0f})"
-        elif rigid_fit.values[i] < 2.0 * rigid_fit.errors[i]:
-            weakness = f"a rough fit finds no positive value ({percent[i]}): other effects hide it"
-        elif rigid_fit.shares[i] < 0.05:
-            weakness = f"it makes only {percent[i]}"
-        elif relative_errors[i] > 0.2:
-            weakness = f"a rough fit finds it only to ± {100 * relative_errors[i]:.0f} % ({percent[i]})"
-        return Identifiability(name, "weak" if weakness else "yes", weakness or f"{evidence}: {percent[i]}")
+        value, error, inflation, share = (
+            float(x[i]) for x in (rigid_fit.values, rigid_fit.errors, rigid_fit.inflation, rigid_fit.shares)
+        )
+        percent, weakness = f"{100 * share:.0f} % of the torque", ""
+        if inflation > 10.0:
+            weakness = f"hard to separate from {similar_term} here (variance × {inflation:.0f})"
+        elif value < 2.0 * error:
+            weakness = f"a rough fit finds no positive value ({percent}): other effects hide it"
+        elif share < 0.05:
+            weakness = f"it makes only {percent}"
+        elif error > 0.2 * abs(value):
+            weakness = f"a rough fit finds it only to ± {100 * error / value:.0f} % ({percent})"
+        return Identifiability(name, "weak" if weakness else "yes", weakness or f"{evidence}: {percent}")
 
-    judgements = [judge("inertia", 0, f"motion up to {width:.3g} Hz", "a spring or gravity")]
-    one_way_text = "motion in one direction only: hard to separate from"
-    if fast < 1.5 * slow:
-        reason = f"speeds of {slow:.3g} to {fast:.3g} are too close to separate viscous from Coulomb friction"
-        judgements += _judge_alike(names[1:3], "weak", reason)
-    else:
-        judgements.append(judge("viscous friction", 1, f"speeds of {slow:.3g} to {fast:.3g}", "Coulomb friction"))
-        if minor_share < 0.05:
-            judgements += _judge_alike(["Coulomb friction"], "weak", f"{one_way_text} a constant torque")
-        else:
-            judgements.append(judge("Coulomb friction", 2, f"{reversals} reversals", "viscous friction"))
-    answer, reason = "yes", f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
+    inertia, *friction = names[:3]
+    constant = Identifiability(
+        names[3], "yes", f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
+    )
+    speeds = f"speeds of {slow:.3g} to {fast:.3g}"
+    judgements = [
+        judge(inertia, 0, f"motion up to {width:.3g} Hz", "a spring or gravity"),
+        judge(friction[0], 1, speeds, friction[1]),
+        judge(friction[1], 2, f"{reversals} reversals", friction[0]),
+    ]
     if minor_share < 0.05:
-        answer, reason = "weak", f"{one_way_text} Coulomb friction"
-    return [*judgements, Identifiability("constant torque", answer, reason)]
-
-
-def _weaken_for_loose_load(judgement: Identifiability) -> Identifiability:
-    """Weaken a judgement by a fit of a rigid body, which says little of a motor whose load follows only loosely."""
-    if judgement.answer == "no" or judgement.quantity == "constant torque":
-        return judgement
-    reason = f"{judgement.reason}; by a fit of a rigid drive, while here the load follows the motor only loosely"
-    return replace(judgement, answer="weak", reason=reason)
+        text = "motion in one direction only: hard to separate from"
+        judgements[2] = Identifiability(friction[1], "weak", f"{text} a constant torque")
+        constant = Identifiability(names[3], "weak", f"{text} {friction[1]}")
+    if fast < 1.5 * slow:
+        reason = f"{speeds} are too close to separate viscous from Coulomb friction"
+        judgements[1:] = _judge_alike(friction, "weak", reason)
+    gearing = record.statistics.gearing
+    if gearing is not None and gearing.is_loose:
+        doubt = "by a fit of a rigid drive, while here the load follows the motor only loosely"
+        judgements = [replace(judgement, answer="weak", reason=f"{judgement.reason}; {doubt}") for judgement in judgements]
+    return [*judgements, constant]
 
 
 def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Identifiability]:

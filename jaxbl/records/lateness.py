@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import fit_with_jackknife, rms, scale_columns
+from .least_squares import column_rms, fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
     MIN_SAMPLES,
@@ -85,33 +85,28 @@ def _fit_lateness(
     period, encoder_count = grid.period, len(encoders)
     columns, moving_rows, torques = [], [], []
     for segment in segments:
-        sample_count = segment.stop - segment.start
-        inner, is_moving = np.zeros(sample_count, bool), np.ones(sample_count, bool)
-        inner[trim_filter_ends(sample_count, cutoff, period)] = True
-        accelerations, other_columns = [], [np.ones(sample_count)]
-        for name in encoders:
-            position = low_pass(grid.values[name][segment], cutoff, period)
-            velocity = _differentiate(position, period)
-            accelerations.append(_differentiate(velocity, period))
-            other_columns += [velocity, np.sign(velocity), position]
-            is_moving &= np.abs(velocity) > _SLOW_SHARE * rms(velocity)
+        position = low_pass(np.stack([grid.values[name][segment] for name in encoders], axis=1), cutoff, period)
+        velocity = _differentiate(position, period)
+        acceleration = _differentiate(velocity, period)
+        # a soft shaft shows in the second derivative of the acceleration
+        snap = _differentiate(_differentiate(acceleration[:, 0], period), period)
+        columns.append(np.column_stack([acceleration, snap, np.ones(len(snap)), velocity, np.sign(velocity), position]))
+        is_slow = (np.abs(velocity) <= _SLOW_SHARE * column_rms(velocity)).any(axis=1)
         # the low-pass smears a reversal over half a period of its cutoff
         reach = math.ceil(0.5 / (cutoff * period))
-        near_reversal = np.asarray(maximum_filter1d(~is_moving, 2 * reach + 1, mode="constant"), bool)
-        # a soft shaft shows in the second derivative of the acceleration
-        snap = _differentiate(_differentiate(accelerations[0], period), period)
-        columns.append(np.stack([*accelerations, snap, *other_columns], axis=1))
-        moving_rows.append(inner & ~near_reversal)
+        is_inner = np.zeros(len(snap), bool)
+        is_inner[trim_filter_ends(len(snap), cutoff, period)] = True
+        moving_rows.append(is_inner & ~np.asarray(maximum_filter1d(is_slow, 2 * reach + 1, mode="constant"), bool))
         torques.append(low_pass(grid.values["u"][segment], cutoff, period))
     motion, rows = np.concatenate(columns), np.concatenate(moving_rows)
     if rows.sum() < 3 * MIN_SAMPLES:
         return None
     lateness, step = 0.0, math.inf
     while True:
-        moved = []
-        for torque in torques:
-            times = period * np.arange(len(torque))
-            moved.append(interpolate_spline(times, torque, times + lateness))
+        moved = [
+            interpolate_spline(times, torque, times + lateness)
+            for times, torque in zip((grid.time[segment] for segment in segments), torques, strict=True)
+        ]
         slope = np.concatenate([_differentiate(torque, period) for torque in moved])[rows]
         target, regressors = np.concatenate(moved)[rows], np.column_stack([motion[rows], -slope])
         values, errors = fit_with_jackknife(target, regressors)
@@ -124,16 +119,12 @@ def _fit_lateness(
             break
     from scipy.signal import welch
 
-    # the slope that no other column explains, and the torque that no column does
-    scaled = scale_columns(regressors)
-    own_slope = slope + scaled[:, :-1] @ np.linalg.lstsq(scaled[:, :-1], -slope, rcond=1e-12)[0]
-    densities = []
-    for signal_part in (target - regressors @ values, own_slope):
-        signal = np.zeros(len(rows))
-        signal[rows] = signal_part
-        densities.append(welch(signal, nperseg=min(2048, len(signal) // 4))[1])
+    # the torque that no column explains, and the slope that no other one does
+    unexplained = np.zeros((2, len(rows)))
+    unexplained[:, rows] = target - regressors @ values, fit_residual(slope, regressors[:, :-1])
+    missing, own_slope = welch(unexplained, nperseg=min(2048, len(rows) // 4))[1]
     # a torque that the columns lack hides in the slope at most what it leaves at the slope's frequencies
-    missing_error = float(np.sum(np.sqrt(densities[0] * densities[1])) / np.sum(densities[1]))
+    missing_error = float(np.sum(np.sqrt(missing * own_slope)) / np.sum(own_slope))
     accelerating_torque = regressors[:, :encoder_count] @ values[:encoder_count]
     inertia = rms(accelerating_torque) / rms(regressors[:, 0])
     # friction f of a load J_s on a shaft K delays it by f / K; J_s² / K is the coefficient of the snap
@@ -147,6 +138,6 @@ def _fit_lateness(
 
 def _differentiate(values: np.ndarray, period: float) -> np.ndarray:
     """Differentiate by central differences of fourth order, of second order at the ends."""
-    slope = np.gradient(values, period)
+    slope = np.gradient(values, period, axis=0)
     slope[2:-2] = (8.0 * (values[3:-1] - values[1:-3]) - (values[4:] - values[:-4])) / (12.0 * period)
     return slope

@@ -26,11 +26,6 @@ def column_rms(columns: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(columns**2, axis=0))
 
 
-def scale_columns(columns: np.ndarray) -> np.ndarray:
-    """Divide each column by its largest magnitude, so that least squares are well conditioned."""
-    return columns / (np.abs(columns).max(axis=0) + 1e-300)
-
-
 @dataclass(frozen=True)
 class BlockRegression:
     """Least squares of a target on columns, by products over blocks of consecutive rows.
@@ -74,11 +69,6 @@ class BlockRegression:
         unit, size = _scale_matrix(total[:-1, :-1] + self.penalty)
         return np.linalg.lstsq(unit, total[:-1, -1] / size, rcond=1e-12)[0] / size
 
-    @property
-    def unit_matrix(self) -> tuple[np.ndarray, np.ndarray]:
-        """Products of the columns over their sizes, and these; infinite of a column of zeros."""
-        return _scale_matrix(self.products.sum(axis=0)[:-1, :-1] + self.penalty)
-
     def fit_without_each(self) -> np.ndarray:
         """Fit the coefficients without each of the blocks, shape (blocks, columns)."""
         return np.array([self.fit([block]) for block in range(len(self.products))])
@@ -110,8 +100,9 @@ def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.n
         Coefficients and standard errors of :class:`BlockRegression`, shape (terms,); NaN if they are not determined.
     """
     regression = BlockRegression.of(target, regressors)
-    if not np.linalg.cond(regression.unit_matrix[0]) <= 1e13:
-        return np.full(regressors.shape[1], np.nan), np.full(regressors.shape[1], np.nan)
+    unit, size = _scale_matrix(regression.products.sum(axis=0)[:-1, :-1])
+    if not np.linalg.cond(unit) <= 1e13:
+        return np.full(len(size), np.nan), np.full(len(size), np.nan)
     return regression.fit(), regression.errors()
 
 
@@ -121,7 +112,16 @@ def jackknife_variance(without: np.ndarray | Sequence[float]) -> np.ndarray:
     return (len(deviations) - 1) / len(deviations) * np.sum(deviations**2, axis=0)
 
 
-def residual_mean_square(target: np.ndarray, regressors: np.ndarray) -> float:
-    """Return the mean square that a fit of regressors, shape (samples, terms), leaves."""
-    scaled = scale_columns(regressors)
-    return float(np.mean((target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]) ** 2))
+def fit_residual(target: np.ndarray, regressors: np.ndarray) -> np.ndarray:
+    """Return what a fit of regressors, shape (samples, terms), leaves of a target, or of several in columns."""
+    # so that least squares are well conditioned
+    scaled = regressors / (np.abs(regressors).max(axis=0) + 1e-300)
+    return target - scaled @ np.linalg.lstsq(scaled, target, rcond=1e-10)[0]
+
+
+def student_interval(value: float, error: float, freedom: int = BLOCKS - 1) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of an estimate whose standard error has so many degrees of freedom."""
+    from scipy.special import stdtrit
+
+    reach = float(stdtrit(max(freedom, 1), 0.975)) * error
+    return value - reach, value + reach

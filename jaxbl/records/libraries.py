@@ -5,7 +5,9 @@
 
 import json
 from array import array
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from itertools import islice
@@ -36,13 +38,14 @@ class Columns(dict[ColumnName, Any]):
         super().__init__(*args, **kwargs)
         self.units: dict[ColumnName, str] = {}
         self.notes: list[str] = []
-        self.unread: dict[str, list[str]] = {}
+        self.unread = defaultdict[str, list[str]](list)
 
     def describe_unread(self) -> list[str]:
         """Return a sentence on each kind of what was not read."""
         return [f"Not read: {', '.join(names[:20])}: {reason}." for reason, names in self.unread.items() if names]
 
 
+@dataclass
 class Column:
     """Values of a column that are loaded when they are used.
 
@@ -51,8 +54,8 @@ class Column:
         rows: number of values.
     """
 
-    def __init__(self, load: Callable[[], Any], rows: int):
-        self.load, self.rows = load, rows
+    load: Callable[[], Any]
+    rows: int
 
     def __len__(self) -> int:
         return self.rows
@@ -128,8 +131,8 @@ _FIRST_MESSAGES = 100
 """Messages of a topic whose names are listed before any of it is selected: several publishers may write to it."""
 
 
-_Messages = Iterator[tuple[str, int, Any]]
-"""Messages of a recording in the order of time: topic, time of recording in ns, the decoded message."""
+_Messages = Iterator[tuple[int, Any]]
+"""Messages of a topic in the order of time: time of recording in ns, the decoded message."""
 
 
 def name_members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -150,23 +153,23 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
     if summary is None or summary.statistics is None:
         raise InputError("has no summary at its end: it was not closed; 'mcap recover' mends it")
     types: dict[int, Any] = {}
-    counts, other_topics = {}, list[str]()
+    counts, other_topics = Counter[str](), list[str]()
     for number, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         if channel.message_encoding == "json" or (channel.message_encoding == "cdr" and schema is not None):
-            counts[channel.topic] = counts.get(channel.topic, 0) + summary.statistics.channel_message_counts.get(number, 0)
+            counts[channel.topic] += summary.statistics.channel_message_counts.get(number, 0)
         else:
             other_topics.append(f"{channel.topic} ({channel.message_encoding})")
 
-    def iterate_messages(topics: Collection[str]) -> _Messages:
+    def iterate_messages(topic: str) -> _Messages:
         with path.open("rb") as file:
-            for schema, channel, message in library.make_reader(file, validate_crcs=True).iter_messages(topics=list(topics)):
+            for schema, channel, message in library.make_reader(file, validate_crcs=True).iter_messages(topics=[topic]):
                 if channel.message_encoding == "json":
-                    yield channel.topic, message.log_time, json.loads(message.data, object_pairs_hook=name_members)
+                    yield message.log_time, json.loads(message.data, object_pairs_hook=name_members)
                 else:
                     if schema.id not in types:
                         types[schema.id] = _message_types(schema)
-                    yield channel.topic, message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
+                    yield message.log_time, types[schema.id].deserialize_cdr(message.data, schema.name)
 
     columns = _recording_columns(counts, iterate_messages, selection)
     columns.unread["messages in other formats than JSON and ROS 2"] = other_topics
@@ -192,25 +195,25 @@ def read_bag(path: Path, selection: Selection = ()) -> Columns:
     """
     library = _import_library("rosbags.highlevel", "a ROS bag", "rosbags")
     with library.AnyReader([path]) as reader:
-        counts: dict[str, int] = {}
+        counts = Counter[str]()
         for connection in reader.connections:
-            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+            counts[connection.topic] += connection.msgcount
 
-    def iterate_messages(topics: Collection[str]) -> _Messages:
+    def iterate_messages(topic: str) -> _Messages:
         with library.AnyReader([path]) as reader:
-            connections = [connection for connection in reader.connections if connection.topic in topics]
+            connections = [connection for connection in reader.connections if connection.topic == topic]
             for connection, time, message in reader.messages(connections=connections):
-                yield connection.topic, time, reader.deserialize(message, connection.msgtype)
+                yield time, reader.deserialize(message, connection.msgtype)
 
     return _recording_columns(counts, iterate_messages, selection)
 
 
 def _recording_columns(
-    counts: dict[str, int], iterate_messages: Callable[[Collection[str]], _Messages], selection: Selection
+    counts: dict[str, int], iterate_messages: Callable[[str], _Messages], selection: Selection
 ) -> Columns:
     """Return the columns of a recording. All messages of the selected topics are read, of others the first ones.
 
-    `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of topics.
+    `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of a topic.
     """
     loaded_values: dict[ColumnName, np.ndarray] = {}
     times: dict[str, np.ndarray] = {}
@@ -218,7 +221,7 @@ def _recording_columns(
     def load_topic(topic: str, names: list[ColumnName]) -> dict[str, None]:
         """Load the times and some columns of a topic; return the names of all its columns."""
         stamps, recording_times, rows, field_names = array("q"), array("q"), array("d"), dict[str, None]()
-        for _, time, message in iterate_messages([topic]):
+        for time, message in iterate_messages(topic):
             numbers = dict(_find_numbers(message, topic, {}))
             field_names |= dict.fromkeys(numbers)
             stamps.append(_find_stamp(message))
@@ -235,11 +238,12 @@ def _recording_columns(
     selected_topics = list[str]()
     for topic in filter(counts.get, counts):
         names = [name for name in selection if str(name).startswith(f"{topic}.")]
-        selected_topics += [topic] if names else []
-        messages = () if names else islice(iterate_messages([topic]), _FIRST_MESSAGES)
-        field_names = (
-            load_topic(topic, names) if names else [name for m in messages for name, _ in _find_numbers(m[2], topic, {})]
-        )
+        if names:
+            selected_topics.append(topic)
+            field_names = load_topic(topic, names)
+        else:
+            messages = islice(iterate_messages(topic), _FIRST_MESSAGES)
+            field_names = [name for _, message in messages for name, _ in _find_numbers(message, topic, {})]
         places |= dict.fromkeys(field_names, topic)
     if not places:
         raise InputError("holds no messages with numbers; a log needs them")

@@ -115,15 +115,14 @@ class _ChannelReader:
     """Converts rows of columns to SI units; it remembers the turns of wrapped positions, and the integrals of speeds."""
 
     def __init__(self, table: LogTable, name: str, columns: Sequence[ColumnName]):
-        self._table, self._channels = table, _stream_channels(table)
+        self._table = table
         self._positions = [table.position_source(name) for name in POSITION_CHANNELS.values()]
         file = LogFile(Path(name), Columns(dict.fromkeys(columns, ())))
-        keys = {channel_table.column_or(channel): channel for channel, channel_table in self._channels.items()}
+        keys = {channel_table.column_or(channel): channel for channel, channel_table in _stream_channels(table).items()}
         self._indices = {
             column: list(columns).index(file.find_column(column, keys.get(column, ""))) for column in stream_columns(table)
         }
-        self._previous: dict[str, float] = {}
-        self._row = 0
+        self._last, self._places, self._row = np.empty((4, 0)), [0.0, 0.0], 0
 
     def decode(self, values: np.ndarray, period: float) -> tuple[np.ndarray, int]:
         """Decode values (rows, columns); `period` (s) is what stamps have to resolve.
@@ -165,29 +164,24 @@ class _ChannelReader:
 
     def convert(self, samples: np.ndarray) -> np.ndarray:
         """Convert decoded samples, shape (4, samples), to SI units, with the turns that they belong to."""
-        positions = [
-            self._read_position(name, values, samples[0])
-            for name, values in zip(POSITION_CHANNELS.values(), samples[2:], strict=True)
-        ]
-        return np.stack([*samples[:2], *positions])
+        from scipy.integrate import cumulative_trapezoid
 
-    def _read_position(self, name: str, values: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-        if not len(values):
-            return values
-        _, table = self._table.position_source(name)
-        if isinstance(table, SpeedTable):
-            speed = to_si(table, values)
-            speeds = np.append(self._previous.get(f"{name} speed", float(speed[0])), speed)
-            times = np.append(self._previous.get(f"{name} time", float(stamps[0])), stamps)
-            # over a gap, too, as if the speed had changed linearly
-            steps = np.diff(times) * 0.5 * (speeds[1:] + speeds[:-1])
-            position = self._previous.get(name, 0.0) + np.cumsum(steps)
-            self._previous |= {name: position[-1], f"{name} speed": speed[-1], f"{name} time": stamps[-1]}
-            return position
-        if table.wrap is not None:
-            values = np.unwrap(np.append(self._previous.get(name, float(values[0])), values), period=table.wrap)[1:]
-            self._previous[name] = values[-1]
-        return to_si(table, values)
+        if not samples.shape[1]:
+            return samples
+        # from the sample before on, if there is one
+        numbers, before = np.concatenate([self._last, samples], axis=1), self._last.shape[1]
+        self._last, positions = samples[:, -1:], []
+        for i, (_, table) in enumerate(self._positions):
+            place = numbers[2 + i]
+            if isinstance(table, SpeedTable):
+                # over a gap, too, as if the speed had changed linearly
+                place = cumulative_trapezoid(to_si(table, place), numbers[0], initial=0.0)
+            elif table.wrap is not None:
+                place = np.unwrap(place, period=table.wrap)
+            place = (place + (self._places[i] - place[0] if before else 0.0))[before:]
+            self._places[i] = place[-1]
+            positions.append(place if isinstance(table, SpeedTable) else to_si(table, place))
+        return np.stack([*samples[:2], *positions])
 
 
 class Stream:

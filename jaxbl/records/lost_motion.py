@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from .least_squares import BLOCKS, fit_with_jackknife, jackknife_variance, rms
+from .least_squares import BLOCKS, fit_with_jackknife, jackknife_variance, rms, student_interval
 from .signal_quality import MIN_SAMPLES
 
 Flank = Literal["motion", "load"]
@@ -43,7 +43,7 @@ class LostMotion:
     ) -> "LostMotion":
         """Return a lost motion whose flank is decided by the direction of motion."""
         return LostMotion(
-            value, error, _compute_interval(value, error, freedom), "motion", changes, (), (value, value), residual
+            value, error, student_interval(value, error, freedom), "motion", changes, (), (value, value), residual
         )
 
     def enclose(self, other: "LostMotion") -> "LostMotion":
@@ -51,13 +51,6 @@ class LostMotion:
         value, error = 0.5 * (self.lost_motion + other.lost_motion), 0.5 * abs(self.lost_motion - other.lost_motion)
         error = math.hypot(error, max(self.lost_motion_error, other.lost_motion_error))
         return self.from_motion(value, error, self.twist_residual, self.flank_changes)
-
-
-def _compute_interval(value: float, error: float, freedom: int) -> tuple[float, float]:
-    from scipy.special import stdtrit
-
-    reach = float(stdtrit(max(freedom, 1), 0.975)) * error
-    return value - reach, value + reach
 
 
 # by the direction of motion
@@ -117,46 +110,38 @@ class _Cells:
 
 
 def _average_passes(
-    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float | None
+    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float
 ) -> _Cells | None:
+    span = float(np.ptp(position))
     moving = np.abs(velocity) > 0.25 * rms(velocity)
-    low, high = float(position.min()), float(position.max())
-    if high == low:
+    if span == 0.0 or moving.sum() < MIN_SAMPLES:
         return None
-    repeats = turn is not None and high - low > 1.5 * turn
-    span = turn if repeats and turn is not None else (high - low) * (1.0 + 1e-9)
-    turns = np.floor((position - low) / span) if repeats else np.zeros(len(position))
-    place = np.clip(((position - low) / span - turns) * BINS, 0, BINS - 1).astype(int)
-    forwards = velocity > 0.0
-    rows = np.flatnonzero(moving)
-    if len(rows) < MIN_SAMPLES:
-        return None
+    # over less than a turn nothing repeats
+    span = turn if span > 1.5 * turn else span * (1.0 + 1e-9)
+    turns, share = np.divmod((position - position.min())[moving] / span, 1.0)
+    place, forwards, times = (BINS * share).astype(int), velocity[moving] > 0.0, times[moving]
     # a long rest may hide a change of the load
-    rests = np.diff(times[rows]) > 0.02 * (times[rows[-1]] - times[rows[0]])
-    pass_number = np.concatenate([[0], np.cumsum((np.diff(forwards[rows]) != 0) | (np.diff(turns[rows]) != 0) | rests)])
-    key = pass_number * BINS + place[rows]
-    _, first, inverse, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
-    enough = count >= max(3, 0.1 * np.median(count))
-    mean = np.bincount(inverse, twist[rows]) / count
-    when = np.bincount(inverse, times[rows]) / count
-    order = np.argsort(when)
-    order = order[enough[order]]
-    first = first[order]
-    return _Cells(
-        mean[order], when[order], place[rows][first], pass_number[first], 2 * place[rows][first] + forwards[rows][first]
+    rests = np.diff(times) > 0.02 * (times[-1] - times[0])
+    pass_number = np.concatenate([[0], np.cumsum((np.diff(forwards) != 0) | (np.diff(turns) != 0) | rests)])
+    _, first, inverse, count = np.unique(
+        pass_number * BINS + place, return_index=True, return_inverse=True, return_counts=True
     )
+    mean, when = (np.bincount(inverse, signal) / count for signal in (twist[moving], times))
+    order = np.argsort(when)
+    order = order[(count >= max(3, 0.1 * np.median(count)))[order]]
+    place, first = place[first[order]], first[order]
+    return _Cells(mean[order], when[order], place, pass_number[first], 2 * place + forwards[first])
 
 
 def _shift_between_states(
-    cells: _Cells, is_late: np.ndarray, selection: np.ndarray | bool = True
+    cells: _Cells, is_late: np.ndarray, selection: np.ndarray | slice = slice(None)
 ) -> tuple[float, np.ndarray]:
     """Return the biweight location of the shifts at places that were crossed in both states, and these shifts.
 
     Where the load hardly pulls, the gap is not crossed in full: the shifts of such places are smaller, and count less.
     """
-    states = [~is_late & selection, is_late & selection]
-    counts = np.array([np.bincount(cells.group[state], minlength=2 * BINS) for state in states])
-    sums = np.array([np.bincount(cells.group[state], cells.twist[state], minlength=2 * BINS) for state in states])
+    index, twist = (cells.group + 2 * BINS * is_late)[selection], cells.twist[selection]
+    counts, sums = (np.bincount(index, weights, 4 * BINS).reshape(2, -1) for weights in (None, twist))
     crossed_twice = (counts > 0).all(axis=0)
     if crossed_twice.sum() < 4:
         return math.nan, np.zeros(0)
@@ -177,22 +162,20 @@ def _shift_between_states(
 
 
 def _find_states(cells: _Cells) -> np.ndarray | None:
-    """Assign one of two states to each cell, with the least residuals and few changes."""
+    """Assign one of two states to each cell, with the least residuals and few changes; None if no shift is between them."""
     count = len(cells.twist)
     centred_twist = cells.subtract_group_means(cells.twist)
     # a single change: the step, less its mean in each place and direction, that fits best
     changes = np.arange(2, count - 1, max(count // 400, 1))
-    before = np.cumsum(np.arange(2 * BINS) == cells.group[:, None], axis=0)[changes - 1]
-    crossed = np.bincount(cells.group, minlength=2 * BINS)
-    size = np.sum(before * (1.0 - before / np.maximum(crossed, 1)), axis=1)
-    gain = np.where(size > 1e-9, np.cumsum(centred_twist)[changes - 1] ** 2 / np.maximum(size, 1e-9), 0.0)
-    starts = [np.arange(count) >= changes[np.argmax(gain)]] if gain.max(initial=0.0) > 0.0 else []
+    passed = np.cumsum(np.arange(2 * BINS) == cells.group[:, None], axis=0)
+    before = passed[changes - 1]
+    size = np.sum(before * (1.0 - before / np.maximum(passed[-1], 1)), axis=1)
+    gain = np.cumsum(centred_twist)[changes - 1] ** 2 / np.maximum(size, 1e-9)
     smooth = np.nanmedian(
         np.lib.stride_tricks.sliding_window_view(np.pad(centred_twist, 4, constant_values=np.nan), 9), axis=1
     )
-    starts.append(smooth > 0.5 * (smooth.min() + smooth.max()))
     best = None
-    for state in starts:
+    for state in (np.arange(count) >= changes[np.argmax(gain)], smooth > 0.5 * (smooth.min() + smooth.max())):
         for _ in range(12):
             shift, _ = _shift_between_states(cells, state)
             if not math.isfinite(shift) or shift == 0.0:
@@ -228,45 +211,36 @@ def _find_best_levels(values: np.ndarray, shift: float, variance: float) -> np.n
 
 
 def fit_lost_motion_by_load(
-    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float | None
+    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float
 ) -> LostMotion | None:
     """Fit the change between passes over the same places in the same direction; None if there is no clear one.
 
-    Position and velocity are the load's. Gear and encoders repeat after a `turn` of it; None on a linear axis.
+    Position and velocity are the load's. Gear and encoders repeat after a `turn` of it; infinite on a linear axis.
     """
     cells = _average_passes(times, twist, position, velocity, turn)
-    if cells is None or len(cells.twist) < 24:
-        return None
-    state = _find_states(cells)
-    if state is None or state.all() or not state.any():
+    if cells is None or len(cells.twist) < 24 or (state := _find_states(cells)) is None:
         return None
     value, shifts = _shift_between_states(cells, state)
-    if not math.isfinite(value):
-        return None
     residuals = cells.subtract_group_means(cells.twist - value * state)
     residual = float(np.std(residuals))
     # two levels stand apart; a drift does not
     if abs(value) < 6.0 * residual or not _explains_more_than_drift(cells, residuals):
         return None
-    passes = np.unique(cells.pass_number)
-    groups = np.array_split(np.arange(BINS), BLOCKS)
-    without_passes = [_shift_between_states(cells, state, cells.pass_number != p)[0] for p in passes]
-    without_places = [
-        _shift_between_states(cells, state, ~np.isin(cells.place, g))[0] for g in groups if np.isin(cells.place, g).any()
-    ]
-    variance = 0.0
-    for without in (without_passes, without_places):
+    variance, passes = 0.0, len(np.unique(cells.pass_number))
+    # by passes, and by neighbouring places
+    for blocks in (cells.pass_number, cells.place // (BINS // BLOCKS)):
+        without = [_shift_between_states(cells, state, blocks != block)[0] for block in np.unique(blocks)]
         finite = [value for value in without if math.isfinite(value)]
         if len(finite) < max(3, len(without) - 1):
             return None
         variance += float(jackknife_variance(finite))
     size, error = abs(value), math.sqrt(variance)
     changes = np.flatnonzero(np.diff(state))
-    if size < 8.0 * error or len(changes) > len(passes):
+    if size < 8.0 * error or len(changes) > passes:
         return None
     change_times = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in changes)
     least, largest = np.quantile(math.copysign(1.0, value) * shifts, [0.1, 0.9])
-    interval = _compute_interval(size, error, min(len(passes), BLOCKS) - 1)
+    interval = student_interval(size, error, min(passes, BLOCKS) - 1)
     return LostMotion(
         size, error, interval, "load", len(change_times), change_times, (float(least), float(largest)), residual
     )

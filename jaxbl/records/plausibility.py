@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -33,9 +33,8 @@ def check_position_moves(file: LogFile, name: str, values: np.ndarray) -> None:
 def check_channels_differ(file: LogFile, channels: Mapping[str, RawChannel]) -> None:
     """Refuse two channels with the same readings, of which one is a position."""
     for (name, first), (other, second) in itertools.combinations(channels.items(), 2):
-        if not {name, other} & set(POSITION_CHANNELS.values()):
-            continue
-        if np.array_equal(first.values, second.values, equal_nan=True) and np.any(first.values):
+        has_position = {name, other} & {*POSITION_CHANNELS.values()}
+        if has_position and np.array_equal(first.values, second.values, equal_nan=True) and np.any(first.values):
             raise file.error(f"{name} and {other} are the same in every row; each needs a column of its own")
 
 
@@ -49,25 +48,25 @@ def note_standstill(file: LogFile, segmented: SegmentedStamps, channels: Mapping
         values, moving = channels[name].values, channels[other].values
         # motion of the other side within two steps of the resolution is not a standstill
         hidden_motion = 2.0 * find_resolution(values) * np.ptp(moving) / np.ptp(values)
-        standstills = (standstill for segment in segmented.segments for standstill in _find_standstills(values, segment))
-        standstill = next(
-            (candidate for candidate in standstills if np.ptp(moving[candidate]) > max(0.2 * np.ptp(moving), hidden_motion)),
-            None,
-        )
-        if standstill is None:
-            continue
-        begin, end = segmented.times[standstill][[0, -1]]
-        is_extreme = values[standstill.start] in (values.min(), values.max())
-        stands = f"{name} stands still{' at the end of its range' * is_extreme} from {begin:.4g} to {end:.4g} s"
-        moves = f"{other} moves by {np.ptp(moving[standstill]):.3g} {channels[other].unit}"
-        file.notes.append(f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow.")
+        least = max(0.2 * np.ptp(moving), hidden_motion)
+        for standstill in _find_standstills(values, segmented.segments):
+            if np.ptp(moving[standstill]) > least:
+                begin, end = segmented.times[standstill][[0, -1]]
+                is_extreme = values[standstill.start] in (values.min(), values.max())
+                stands = f"{name} stands still{' at the end of its range' * is_extreme} from {begin:.4g} to {end:.4g} s"
+                moves = f"{other} moves by {np.ptp(moving[standstill]):.3g} {channels[other].unit}"
+                file.notes.append(
+                    f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow."
+                )
+                break
 
 
-def _find_standstills(values: np.ndarray, segment: slice) -> Iterator[slice]:
-    """Yield the rows of a segment in which the values are equal for at least `_STANDSTILL_SAMPLES`."""
-    for start, stop in zip(*find_runs(np.diff(values[segment]) == 0.0), strict=True):
-        if stop - start >= _STANDSTILL_SAMPLES - 1:
-            yield slice(segment.start + start, segment.start + stop + 1)
+def _find_standstills(values: np.ndarray, segments: Sequence[slice]) -> Iterator[slice]:
+    """Yield the rows of segments in which the values are equal for at least `_STANDSTILL_SAMPLES`."""
+    for segment in segments:
+        for start, stop in zip(*find_runs(np.diff(values[segment]) == 0.0), strict=True):
+            if stop - start >= _STANDSTILL_SAMPLES - 1:
+                yield slice(segment.start + start, segment.start + stop + 1)
 
 
 GEAR_TOLERANCE = 0.25
@@ -204,21 +203,18 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     A passive drive takes energy from its input, and its inertia is positive. `position` is that of the encoder which the
     torque `u` moves, rad (m), shape (samples,).
     """
-    work = exchanged = travel = displacement = 0.0
-    for segment in grid.segments:
-        torque, steps = grid.values["u"][segment][:-1], np.diff(position[segment])
-        work += float(torque @ steps)
-        exchanged += float(np.abs(torque) @ np.abs(steps))
-        travel += float(np.abs(steps).sum())
-        displacement += abs(float(position[segment][-1] - position[segment][0]))
-    work_share = work / exchanged if exchanged else 0.0
+    moves = [np.diff(position[segment]) for segment in grid.segments]
+    displacement, steps = sum(abs(move.sum()) for move in moves), np.concatenate(moves)
+    torque = np.concatenate([grid.values["u"][segment][:-1] for segment in grid.segments])
+    exchanged = np.abs(torque) @ np.abs(steps)
+    work_share = float(torque @ steps / exchanged) if exchanged else 0.0
     has_clear_inertia = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
     # 8 standard errors prove the wrong sign, 3 are enough for the right one
     accelerates_against_torque, accelerates_with_torque = (
         has_clear_inertia and sign * rigid_fit.values[0] > errors_required * rigid_fit.errors[0]
         for sign, errors_required in ((-1.0, 8.0), (1.0, 3.0))
     )
-    if displacement > 0.2 * travel:
+    if displacement > 0.2 * np.abs(steps).sum():
         # potential energy may pay for the motion
         work_share = max(work_share, 0.0)
     if accelerates_against_torque and work_share < 0.02:
@@ -265,20 +261,19 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     / 2, the model's f <ω²>; noise, gaps and shafts do not change this. Without nominal friction this part is left out.
     """
     nominal_inertia, nominal_viscous = nominal.refer_to(channel)
-    inertia, inertia_error = float(rigid_fit.values[0]), float(rigid_fit.errors[0])
-    viscous = float(rigid_fit.values[1])
-    shows_viscous = abs(viscous) > 8.0 * float(rigid_fit.errors[1]) and rigid_fit.inflation[1] < 10.0
+    inertia, viscous = rigid_fit.values[:2].tolist()
+    shows_viscous = abs(viscous) > 8.0 * rigid_fit.errors[1] and rigid_fit.inflation[1] < 10.0
     nominal_power = nominal_viscous * rigid_fit.square
     friction_power = rigid_fit.power + 0.5 * nominal_inertia * rigid_fit.slowing
-    power_ratio = friction_power / nominal_power if nominal_power > 0.0 and friction_power > 0.0 else None
-    if power_ratio is not None and power_ratio >= _DOUBTFUL_FRICTION:
-        power_ratio = max(viscous / nominal_viscous, 1.0) if shows_viscous else None
-    has_usual_friction = power_ratio is not None and 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
+    power_ratio = friction_power / nominal_power if min(nominal_power, friction_power) > 0.0 else math.nan
+    if power_ratio >= _DOUBTFUL_FRICTION:
+        power_ratio = max(viscous / nominal_viscous, 1.0) if shows_viscous else math.nan
+    has_usual_friction = 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
     sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
     text, ratio, doubtful_ratio, sure_ratio = "", 1.0, math.inf, math.inf
     # a coefficient that noise, gravity, a gap or a spring hides says nothing
     if (
-        inertia > 4.0 * inertia_error
+        inertia > 4.0 * rigid_fit.errors[0]
         and rigid_fit.shares[0] > 0.05
         and rigid_fit.inflation[0] < 10.0
         and rigid_fit.residual < 0.5
@@ -295,22 +290,20 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         doubtful_ratio, sure_ratio = _DOUBTFUL_TORQUE, _SURE_FACTOR * _DOUBTFUL_TORQUE
     is_doubtful = not 1.0 / _DOUBTFUL_INERTIA < ratio < doubtful_ratio
     is_surely_wrong = not (has_usual_friction or 1.0 / sure_factor < ratio < sure_ratio)
-    if power_ratio is not None and not has_usual_friction and not is_doubtful:
-        text = (
-            f"friction takes {friction_power:.3g} W, in what is viscous {power_ratio:.3g} times the nominal"
-            if power_ratio > 1.0
-            else f"friction takes {friction_power:.3g} W, {power_ratio:.3g} times what the nominal viscous friction would"
-        )
+    has_odd_friction = not (has_usual_friction or math.isnan(power_ratio))
+    if has_odd_friction and not is_doubtful:
+        multiple = f"in what is viscous {power_ratio:.3g} times the nominal"
+        if power_ratio < 1.0:
+            multiple = f"{power_ratio:.3g} times what the nominal viscous friction would"
+        text = f"friction takes {friction_power:.3g} W, {multiple}"
         # the nominal friction may be wrong, so this alone is not sure
         is_doubtful, is_surely_wrong, ratio = True, False, 1.0 / power_ratio
     if is_doubtful:
         file.warnings.append(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
-    same_direction = power_ratio is not None and not has_usual_friction and (power_ratio > 1.0) == (ratio > 1.0)
-    if (
-        # friction that falls with the speed takes work none the less
-        friction_power < 0.0 and shows_viscous and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0
-    ):
+    same_direction = has_odd_friction and (power_ratio > 1.0) == (ratio > 1.0)
+    # friction that falls with the speed takes work none the less
+    if friction_power < 0.0 and shows_viscous and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0:
         file.contradiction = (
             f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "
             f"{nominal_viscous:.3g}: set sign = -1 in [log] u"
@@ -362,20 +355,15 @@ def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: np.nda
         )
 
 
-def note_skew(file: LogFile, gearing: Gearing, period: float) -> None:
-    """Remark on a skew between both encoders that is significant and more than 5 % of the `period`, s."""
-    if gearing.skew is None or gearing.skew_error is None:
-        return
-    if abs(gearing.skew) > 6.0 * gearing.skew_error and abs(gearing.skew) > 0.05 * period:
-        direction = "lags" if gearing.skew > 0.0 else "leads"
+def note_gearing(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelStatistics], period: float) -> None:
+    """Remark on a significant skew of more than 5 % of the `period`, s, and on a lost motion that exceeds the noise."""
+    skew, error = gearing.skew or 0.0, gearing.skew_error or 0.0
+    if abs(skew) > max(6.0 * error, 0.05 * period):
+        direction = "lags" if skew > 0.0 else "leads"
         file.notes.append(
-            f"theta_s {direction} theta_e by {1e3 * abs(gearing.skew):.3g} ± {1e3 * gearing.skew_error:.2g} ms: a skew of "
+            f"theta_s {direction} theta_e by {1e3 * abs(skew):.3g} ± {1e3 * error:.2g} ms: a skew of "
             "the stamps, or viscous friction of the load that winds up the shaft; this log cannot tell them apart."
         )
-
-
-def note_lost_motion(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelStatistics]) -> None:
-    """Remark on the lost motion if it exceeds the noise of both encoders."""
     unit = statistics["theta_e"].unit
     text = f"Lost motion at the motor: {gearing.describe_lost_motion(unit)}"
     if gearing.flank == "load":

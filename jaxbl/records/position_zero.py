@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import BLOCKS, column_rms, fit_with_jackknife, jackknife_variance, rms
+from .least_squares import BLOCKS, column_rms, fit_residual, fit_with_jackknife, jackknife_variance, rms
 from .rigid_body import MIN_SPEED_SHARE, smooth_sign
 from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 
@@ -63,12 +63,11 @@ class ZeroShift(NamedTuple):
 
 
 class _MovingRows(NamedTuple):
-    """Low-passed rows in motion: torque, acceleration and other columns, cos(n position), sin(n position), n = 1, 2, ..."""
+    """Low-passed rows in motion: torque, acceleration and other columns, exp(i n position), n = 1, 2, ..."""
 
     torque: np.ndarray
     columns: np.ndarray
-    cosine: np.ndarray
-    sine: np.ndarray
+    waves: np.ndarray
 
 
 def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
@@ -110,12 +109,12 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     turns = np.exp(1j * harmonics[:, None] * shifts) * size[:, None]
     # what the motion takes is known by the first log, but for constants
     torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1] - 1]
-    signals = np.column_stack([torque, rows.cosine[:, waves] @ turns.real - rows.sine[:, waves] @ turns.imag])
-    constants = np.column_stack([rows.columns[:, ~varies], np.ones(len(signals))])
-    residuals = signals - constants @ np.linalg.lstsq(constants, signals, rcond=1e-10)[0]
-    blocks = np.array_split(np.arange(len(signals)), BLOCKS)
-    squares_without_waves = np.array([np.sum(residuals[block, 0] ** 2) for block in blocks])
-    squares = np.array([np.sum((residuals[block, :1] - residuals[block, 1:]) ** 2, axis=0) for block in blocks])
+    signals = np.column_stack([torque, (rows.waves[:, waves] @ turns).real])
+    residuals = fit_residual(signals, np.column_stack([rows.columns[:, ~varies], np.ones(len(signals))]))
+    # without waves, and with those at each shift
+    residuals[:, 1:] -= residuals[:, :1]
+    block_squares = np.array([np.sum(part**2, axis=0) for part in np.array_split(residuals, BLOCKS)])
+    squares_without_waves, squares = block_squares[:, 0], block_squares[:, 1:]
     total = squares.sum(axis=0)
     best = int(np.argmin(total))
     if not _error_reduction(squares_without_waves, squares[:, best]) > _SURE_SHIFT_ERRORS:
@@ -128,7 +127,7 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     step = shifts[1] - shifts[0]
     value, *without = (
         shifts[chosen] + step * (_parabola_minimum(sums[near]) - _SHIFTS_PER_PERIOD // 2)
-        for sums in (total, *(total - block_squares for block_squares in squares))
+        for sums in (total, *(total - squares))
     )
     error = float(np.sqrt(jackknife_variance(without)))
     if not abs(value) > _SURE_ERRORS * error:
@@ -148,11 +147,10 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
     columns, values = motion, np.zeros(0)
     while len(waves) < _MOST_WAVES:
         basis = np.linalg.qr(columns)[0]
-        parts = (rows.torque[:, None], rows.cosine[:, lowest:], rows.sine[:, lowest:])
-        torque, cosine, sine = (part - basis @ (basis.T @ part) for part in parts)
-        pairs = [np.linalg.qr(np.column_stack(pair))[0] for pair in zip(cosine.T, sine.T, strict=True)]
+        torque, candidates = (part - basis @ (basis.T @ part) for part in (rows.torque, rows.waves[:, lowest:]))
+        pairs = [np.linalg.qr(np.column_stack([wave.real, wave.imag]))[0] for wave in candidates.T]
         wave = lowest + int(np.argmax([np.sum((pair.T @ torque) ** 2) for pair in pairs]))
-        columns = np.column_stack([columns, rows.cosine[:, wave], rows.sine[:, wave]])
+        columns = np.column_stack([columns, np.real(rows.waves[:, wave]), np.imag(rows.waves[:, wave])])
         coefficients, errors = fit_with_jackknife(rows.torque, columns)
         if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_ERRORS:
             break
@@ -172,23 +170,18 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
         # long logs: only as many samples as the low-pass needs
         inner = trim_filter_ends(len(place), cutoff, log.period)
         rows = slice(inner.start, inner.stop, max(int(0.1 / (cutoff * log.period)), 1))
-        cosine, sine = (
-            np.stack(
-                [low_pass(wave(n * log.motor[s]), cutoff, log.period)[rows] for n in range(1, _MAX_HARMONIC + 1)], axis=1
-            )
-            for wave in (np.cos, np.sin)
-        )
+        turns = (np.exp(1j * n * log.motor[s]) for n in range(1, _MAX_HARMONIC + 1))
+        waves = np.stack([low_pass(turn, cutoff, log.period)[rows] for turn in turns], axis=1)
         held = log.torque[s]
         torque = low_pass(0.5 * (np.append(held[:1], held[:-1]) + held), cutoff, log.period)[rows]
-        parts.append((torque, np.column_stack(columns)[rows], cosine, sine))
+        parts.append((torque, np.column_stack(columns)[rows], waves))
     if not parts:
         return None
-    rows_in_segments = _MovingRows(*map(np.concatenate, zip(*parts, strict=True)))
-    speed = np.abs(rows_in_segments.columns[:, 1])
-    rows = speed > MIN_SPEED_SHARE * rms(speed)
-    if np.sum(rows) <= _MIN_ROWS:
+    signals = [np.concatenate(pieces) for pieces in zip(*parts, strict=True)]
+    speed = np.abs(signals[1][:, 1])
+    moving_rows = _MovingRows(*(signal[speed > MIN_SPEED_SHARE * rms(speed)] for signal in signals))
+    if len(moving_rows.torque) <= _MIN_ROWS:
         return None
-    moving_rows = _MovingRows(*(columns_of_rows[rows] for columns_of_rows in rows_in_segments))
     if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
         # in one direction the sign of the velocity is a constant
         moving_rows.columns[:, 2] = 1.0

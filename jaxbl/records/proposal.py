@@ -90,26 +90,27 @@ def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
     return name, _UNIT_NAMES.get(unit, unit)
 
 
-def _matches(kind: str, name: str) -> bool:
-    """Return True if a name, or a word of it, is usual for a kind of column."""
-    return any(re.fullmatch(_NAME_PATTERNS[kind], word) for word in (name.replace(" ", "_"), *name.split()))
+def _find_kinds(name: str) -> set[str]:
+    """Return the kinds of columns for which a name, or a word of it, is usual."""
+    words = name.replace(" ", "_"), *name.split()
+    return {kind for kind, pattern in _NAME_PATTERNS.items() if any(re.fullmatch(pattern, word) for word in words)}
 
 
-def _guess_channel(name: str, unit: str) -> str:
-    """Guess the channel of a column from its name and unit; "" for none."""
-    side = "s" if _matches("load", name) else "e"
-    if _matches("t", name) or (not name and unit in SECONDS_PER_UNIT):
+def _guess_channel(name: str, unit: str, kinds: set[str]) -> str:
+    """Guess the channel of a column from its name, unit and kinds; "" for none."""
+    side = "s" if "load" in kinds else "e"
+    if "t" in kinds or (not name and unit in SECONDS_PER_UNIT):
         return "t"
     # an unknown unit fits any quantity
     fitting = [kind for kind, units in _CHANNEL_UNITS.items() if unit in units or unit not in _SPELLINGS]
-    if "u" in fitting and (_matches("u", name) or unit in ("N m", "mN m") or (not name and unit in ("mA", "A"))):
+    if "u" in fitting and ("u" in kinds or unit in ("N m", "mN m") or (not name and unit in ("mA", "A"))):
         return "u"
-    if _matches("omega", name) or unit in SPEED_FACTORS:
+    if "omega" in kinds or unit in SPEED_FACTORS:
         return f"omega_{side}" if "omega" in fitting or unit == "counts" else ""
     # motor or load as the only word does not tell the quantity: a temperature is one of the motor, too
     is_bare_side = name in ("motor", "load", "output", "arm", "joint", "link", "secondary") and not unit
-    has_position_unit = unit in POSITION_FACTORS and (not name or _matches("motor", name) or side == "s")
-    is_position = _matches("position", name) and "theta" in fitting
+    has_position_unit = unit in POSITION_FACTORS and (not name or kinds & {"motor", "load"})
+    is_position = "position" in kinds and "theta" in fitting
     return f"theta_{side}" if is_position or is_bare_side or has_position_unit else ""
 
 
@@ -123,33 +124,32 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     candidates: dict[str, list[_Candidate]] = {}
     for column in file.columns:
         name, unit = _split_unit(file, column)
-        channel, is_setpoint = _guess_channel(name, unit), _matches("setpoint", name)
+        kinds = _find_kinds(name)
+        channel = _guess_channel(name, unit, kinds)
         # a commanded torque stands for one that was not measured, a side alone for a position
-        is_second_choice = not _matches("position", name)
-        if channel == "u":
-            is_second_choice = is_setpoint or _matches("load", name) or _matches("supply", name)
+        is_second_choice = bool(kinds & {"setpoint", "load", "supply"}) if channel == "u" else "position" not in kinds
         values = file.load_values(column) if channel else np.zeros(0)
-        if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or not is_setpoint)):
+        if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or "setpoint" not in kinds)):
             candidates.setdefault(channel, []).append(_Candidate(is_second_choice, column, name, unit, values))
     guesses: list[str] = []
     table: _Table = {}
-    if not candidates.get("t") or not _POSITIONS & {*candidates}:
+    if "t" not in candidates or candidates.keys().isdisjoint(_POSITIONS):
         table |= _add_candidates_by_values(file, candidates, guesses)
     chosen: dict[str, _Candidate] = {}
     # the torque is chosen to the position
-    for channel in sorted(candidates, key=("t", "theta_e", "theta_s", "omega_e", "omega_s", "u").index):
+    for channel in filter(candidates.get, ("t", *_POSITIONS, "u")):
         words = {word for candidate in chosen.values() for word in candidate.name.split()}
         chosen[channel] = _choose(candidates[channel], words)
     if "theta_e" in chosen and not chosen["theta_e"].is_second_choice and chosen.get("theta_s", ("",) * 3)[2] == "load":
         # beside a named position it is how much a servo is loaded
         chosen["u"] = chosen.pop("theta_s")
     for channel, candidate in chosen.items():
-        if channel == "u" and _matches("setpoint", candidate.name):
+        if channel == "u" and "setpoint" in _find_kinds(candidate.name):
             guesses.append(f"u is '{candidate.column}', the commanded torque: no column looks like a measured one.")
         # a measured position is better than the integral of a speed
         if channel.replace("omega", "theta") not in {*chosen} - {channel}:
             table[channel] = _make_table(channel, candidate, guesses)
-    if not _POSITIONS & {*table}:
+    if table.keys().isdisjoint(_POSITIONS):
         columns = ", ".join(map(str, file.columns))
         raise InputError(f"{path}: no column is called like a position or a speed: {columns}; [log] theta_e can name one")
     if "u" not in table:
@@ -160,7 +160,7 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
     return table, guesses
 
 
-_POSITIONS = {"theta_e", "theta_s", "omega_e", "omega_s"}
+_POSITIONS = "theta_e", "theta_s", "omega_e", "omega_s"
 """Channels of which a log has one at least."""
 
 
@@ -176,12 +176,12 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
     if times is None and (stamps := find_stamps(signals)) is not None:
         by_values["t"], times = stamps, signals[stamps]
     table: _Table = {}
-    if not _POSITIONS & {*candidates}:
+    if candidates.keys().isdisjoint(_POSITIONS):
         named = {candidate.column for columns in candidates.values() for candidate in columns}
         moving = {
             column: values.astype(float)
             for column, values in signals.items()
-            if column not in named and not _matches("setpoint", _split_unit(file, column)[0])
+            if column not in named and "setpoint" not in _find_kinds(_split_unit(file, column)[0])
             if values.dtype.kind in "iuf" and not rises_evenly(values) and np.isfinite(values).all() and np.ptp(values)
         }
         channels, period = find_moving_columns(moving, times)
@@ -190,10 +190,8 @@ def _add_candidates_by_values(file: LogFile, candidates: dict[str, list[_Candida
             table["t"] = {"period": period}
             guesses.append(f"The period is taken to be {period:g} s: a speed then is the slope of the position.")
     for channel, column in by_values.items():
-        for other, columns in [*candidates.items()]:
-            candidates[other] = [candidate for candidate in columns if candidate.column != column]
-            if not candidates[other]:
-                del candidates[other]
+        for columns in candidates.values():
+            columns[:] = [candidate for candidate in columns if candidate.column != column]
         candidates[channel] = [_Candidate(False, column, *_split_unit(file, column), signals[column])]
         guesses.append(f"{channel} is taken to be column '{column}' by how its numbers change.")
     return table
@@ -273,8 +271,9 @@ def propose_study(
         pass
     if nominal is None or (gear_ratio is not None and not math.isfinite(nominal.stiffness)):
         rough = _fit_nominal_drive(inspection, guesses, gear_ratio)
-        numbers = {name: value for name, value in vars(rough).items() if name not in ("gear_ratio", "dead_time")}
-        nominal = replace(rough, **{name: _round_to_3_digits(value) for name, value in numbers.items()})
+        exact = "gear_ratio", "dead_time"
+        rounded = {name: _round_to_3_digits(value) for name, value in vars(rough).items() if name not in exact}
+        nominal = replace(rough, **rounded)
     else:
         guesses.append("The numbers of the drive are those of the model.")
     ratio = (gear_ratio or nominal.gear_ratio) if math.isfinite(nominal.stiffness) else None
@@ -325,7 +324,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     if dynamics is None:
         guesses.append("The log does not show an inertia: 1 is a placeholder.")
     else:
-        inertia, viscous = (float(value) for value in dynamics.values[:2])
+        inertia, viscous = dynamics.values[:2].tolist()
         if inertia < 2.0 * float(dynamics.errors[0]) or inertia <= 0.0:
             # then the inertia takes a small part of the torque
             inertia = 0.1 * dynamics.torque / dynamics.acceleration

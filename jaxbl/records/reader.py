@@ -14,7 +14,7 @@ from jaxbl.lines import DOUBT
 from jaxbl.units import on_a_line
 from jaxbl.validation import check_sizes, explain_first_error
 
-from .alignment import NominalDrive, Skew, find_encoder_offset, judge_clock_skew, max_windup_delay
+from .alignment import NominalDrive, find_clock_skew, find_encoder_offset, max_windup_delay
 from .channels import RawChannel, read_channels
 from .files import LogFile, read_log_file
 from .gearing import Drift, Gearing, fit_drift, fit_gearing
@@ -26,9 +26,8 @@ from .plausibility import (
     check_torque_sign,
     flag_wrong_units,
     note_channel_faults,
+    note_gearing,
     note_host_stamps,
-    note_lost_motion,
-    note_skew,
     note_standstill,
 )
 from .resampling import Delay, Grid, resample_channels
@@ -204,8 +203,7 @@ def read_record(
     if gearing is not None:
         gearing = replace(gearing, flank_times=tuple(t - float(grid.time[0]) for t in gearing.flank_times))
         statistics["theta_s"] = replace(statistics["theta_s"], skew=gearing.skew, skew_error=gearing.skew_error)
-        note_skew(file, gearing, grid.period)
-        note_lost_motion(file, gearing, statistics)
+        note_gearing(file, gearing, statistics, grid.period)
     if lateness is not None and lateness.error < segmented.period:
         statistics["u"] = replace(statistics["u"], skew=lateness.value, skew_error=lateness.error)
     return Record(
@@ -254,15 +252,14 @@ def _resample_and_align(
         grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
         if table.kind == "element" or len(encoders) < 2:
             return grid, None
-        turn = None if channels["theta_s"].unit == "m" else 2.0 * math.pi
+        turn = math.inf if channels["theta_s"].unit == "m" else 2.0 * math.pi
         return grid, fit_gearing(grid.first(share), expected=gear_ratio, turn=turn)
 
     grid, gearing = resample()
     lateness = None
     if "u" in channels and table.kind == "drive":
         lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
-        keys = None if lateness is None else _find_torque_keys(file, table, lateness, nominal, segmented.period)
-        if lateness is not None and keys is not None:
+        if lateness is not None and (keys := _find_torque_keys(file, table, lateness, nominal, segmented.period)):
             hold, skew = keys
             channels = {**channels, "u": channels["u"]._replace(hold=hold)}
             delays["u"] = Delay(skew)
@@ -271,10 +268,10 @@ def _resample_and_align(
             lateness = lateness._replace(value=lateness.value - late)
             grid, gearing = resample()
     is_estimated = any(raw.skew == "estimate" for raw in channels.values())
-    may_correct = shaft is not None and _is_left_out(table, "skew")
+    shaft = shaft if _is_left_out(table, "skew") else None
     sentences = []
-    if gearing is not None and (is_estimated or may_correct) and _is_left_out(table, "drift"):
-        drift = _find_clock_drift(gearing, grid.first(share), shaft if may_correct else None)
+    if gearing is not None and (is_estimated or shaft is not None) and _is_left_out(table, "drift"):
+        drift = _find_clock_drift(gearing, grid.first(share), shaft)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
             delays["theta_s"] = Delay(-drift.value * middle, drift.value)
@@ -283,19 +280,24 @@ def _resample_and_align(
                 f"The clocks drift apart: theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± "
                 f"{1e6 * drift.error:.1g} us each second. This was corrected."
             )
-    initial_delay = delays.get("theta_s", Delay())
+    skew = 0.0
     if is_estimated:
-        delays["theta_s"] = Delay(initial_delay.skew + _estimate_skew(file, gearing, period), initial_delay.drift)
+        skew = _estimate_skew(file, gearing, period)
+    elif shaft is not None and gearing is not None:
+        clock_skew = find_clock_skew(gearing, grid.first(share), shaft)
+        if clock_skew is not None:
+            skew = clock_skew.value
+            place = " in the middle of the log" if sentences else ""
+            sentences.append(
+                f"theta_s is {_describe_delay(skew, clock_skew.error)} than theta_e{place}. Friction can cause at most "
+                f"{1e3 * clock_skew.max_windup_delay:.2g} ms, so this was corrected."
+            )
+    if skew:
+        delays["theta_s"] = delays["theta_s"]._replace(skew=delays["theta_s"].skew + skew)
         grid, gearing = resample()
-    elif may_correct and shaft is not None and gearing is not None:
-        clock_skew = judge_clock_skew(gearing, grid.first(share), shaft)
-        if clock_skew is not None and clock_skew.is_sure:
-            delays["theta_s"] = Delay(initial_delay.skew + clock_skew.value, initial_delay.drift)
-            grid, gearing = resample()
-            sentences.append(_describe_skew(clock_skew, " in the middle of the log" if sentences else ""))
     if sentences:
         file.warnings.append(" ".join([*sentences, _describe_delay_keys(table, delays["theta_s"])]))
-    if may_correct and any(delays["theta_s"]):
+    if shaft is not None:
         file.corrections |= {key: correction for key, correction in delays["theta_s"]._asdict().items() if correction}
     if not regular:
         purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
@@ -318,8 +320,7 @@ def _find_torque_keys(
     size, half_periods = abs(lateness.value), lateness.half_periods
     if not (lateness.is_known and is_left_out and size > 3.0 * lateness.error) or half_periods == 0:
         return None
-    direction = "later" if lateness.value > 0.0 else "earlier"
-    text = f"u is {1e3 * size:.3g} ± {1e3 * lateness.error:.1g} ms {direction} than the motion that it causes"
+    text = f"u is {_describe_delay(lateness.value, lateness.error)} than the motion that it causes"
     if half_periods is None:
         file.notes.append(
             f"{text}, which is no multiple of half a period: a filter of u, a soft shaft or a lag may cause it. Nothing was "
@@ -374,12 +375,8 @@ def _is_left_out(table: LogTable, key: str) -> bool:
     return getattr(motor, key, None) is None and getattr(load, key, 0.0) is None
 
 
-def _describe_skew(skew: Skew, place: str) -> str:
-    direction = "later" if skew.value > 0.0 else "earlier"
-    return (
-        f"theta_s is {1e3 * abs(skew.value):.3g} ± {1e3 * skew.error:.1g} ms {direction} than theta_e{place}. Friction can "
-        f"cause at most {1e3 * skew.max_windup_delay:.2g} ms, so this was corrected."
-    )
+def _describe_delay(value: float, error: float) -> str:
+    return f"{1e3 * abs(value):.3g} ± {1e3 * error:.1g} ms {'later' if value > 0.0 else 'earlier'}"
 
 
 def _describe_delay_keys(table: LogTable, delay: Delay) -> str:
@@ -394,10 +391,8 @@ def _correct_offset(
 ) -> None:
     """Subtract a sure offset between the encoders from theta_e; warn of a possible one."""
     integrals = [name for name in POSITION_CHANNELS.values() if table.position_source(name)[0] != name]
-    if not integrals and not _is_left_out(table, "offset"):
-        return
-    offset = find_encoder_offset(grid.first(share), nominal)
-    if offset is None:
+    may_correct = integrals or _is_left_out(table, "offset")
+    if not may_correct or (offset := find_encoder_offset(grid.first(share), nominal)) is None:
         return
     # an integral may begin at any position
     name = integrals[0] if integrals else "theta_e"
@@ -419,11 +414,7 @@ def _correct_offset(
             f"{change:.4g} corrects the same; 0 corrects nothing."
         )
         return
-    cause = (
-        "a constant torque in the shaft"
-        if offset.both_flanks
-        else "a constant torque that holds the load on one flank of a gap"
-    )
+    cause = f"a constant torque {'in the shaft' if offset.both_flanks else 'that holds the load on one flank of a gap'}"
     file.warnings.append(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
         f"[log] theta_e.offset = {change:.4g} corrects it as an offset; 0 corrects nothing."
@@ -442,10 +433,7 @@ def _measure_channel(
     is_position = name.startswith("theta")
     jumps, saturated = 0, raw.saturated
     if is_position:
-        is_even = segmented.sampling.even
-        jumps = sum(
-            count_jumps(raw.values[rows], step, None if is_even else segmented.times[rows]) for rows in segmented.segments
-        )
+        jumps = sum(count_jumps(raw.values[rows], step, segmented.times[rows]) for rows in segmented.segments)
     elif not saturated:
         saturated = saturated_share(readings, step)
     statistics = ChannelStatistics(
@@ -480,8 +468,8 @@ def join_records(records: Sequence[Record]) -> Record:
     first = records[0]
     if len(records) == 1:
         return first
-    period, count, end = first.sample_period, 0, 0.0
-    times, segments, logs, notes, warnings = [], [], [], [], []
+    period, end = first.sample_period, 0.0
+    times, segments, logs = [], [], []
     for record in records:
         if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
             raise InputError(
@@ -490,14 +478,12 @@ def join_records(records: Sequence[Record]) -> Record:
             )
         _require_channels(record, _list_channels(first), first)
         _require_channels(first, _list_channels(record), record)
+        count = sum(map(len, times))
         times.append(record.time - record.time[0] + end)
         end = float(times[-1][-1]) + _PAUSE_PERIODS * period
         segments += [slice(segment.start + count, segment.stop + count) for segment in record.segments]
         logs += [(path, slice(rows.start + count, rows.stop + count)) for path, rows in record.logs]
-        count += len(record.time)
-        notes += [f"{record.path.name}: {note}" for note in record.notes]
-        warnings += [f"{record.path.name}: {warning}" for warning in record.warnings]
-    notes.insert(0, f"{len(records)} logs, one after the other: {', '.join(record.path.name for record in records)}.")
+    names = ", ".join(record.path.name for record in records)
     joined = {name: np.concatenate([_list_channels(record)[name] for record in records]) for name in _list_channels(first)}
     return replace(
         first,
@@ -507,8 +493,11 @@ def join_records(records: Sequence[Record]) -> Record:
         transmitted=joined.get("transmitted torque"),
         reference=joined.get("reference"),
         segments=tuple(segments),
-        notes=tuple(notes),
-        warnings=tuple(warnings),
+        notes=(
+            f"{len(records)} logs, one after the other: {names}.",
+            *(f"{record.path.name}: {note}" for record in records for note in record.notes),
+        ),
+        warnings=tuple(f"{record.path.name}: {warning}" for record in records for warning in record.warnings),
         intervals=np.concatenate([record.intervals for record in records]),
         logs=tuple(logs),
     )
@@ -522,6 +511,6 @@ def _require_channels(record: Record, names: Iterable[str], other: Record) -> No
 
 
 def _list_channels(record: Record) -> dict[str, np.ndarray]:
-    torques = {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
-    positions = {f"{side} position": values for side, values in record.positions.items()}
-    return positions | {name: values for name, values in torques.items() if values is not None}
+    channels = {f"{side} position": values for side, values in record.positions.items()}
+    channels |= {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
+    return {name: values for name, values in channels.items() if values is not None}

@@ -1,5 +1,6 @@
 """Resampling: channels at their own time stamps become evenly spaced samples, moved by their skews."""
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
@@ -8,7 +9,7 @@ import numpy as np
 
 from .channels import RawChannel
 from .files import LogFile
-from .signal_quality import MIN_SAMPLES, interpolate_spline, segments_before
+from .signal_quality import MIN_SAMPLES, interpolate_spline, segments_before, slices_between
 from .time_stamps import SegmentedStamps
 
 _MAX_OVERSAMPLING = 100
@@ -63,7 +64,7 @@ def resample_channels(
     Raises:
         InputError: all segments are too short for the period and the skews.
     """
-    times, values, segments, first_row, short = [], {name: [] for name in channels}, [], 0, []
+    times, values, short = [], {name: [] for name in channels}, []
     for segment in segmented.segments:
         stamps = segmented.times[segment]
         first = float(stamps[0])
@@ -83,30 +84,27 @@ def resample_channels(
                 readings = interpolate_spline(reading_times, readings, grid)
             values[name].append(readings)
         times.append(grid)
-        segments.append(slice(first_row, first_row + len(grid)))
-        first_row += len(grid)
     if short:
         count, first = max(short)
         text = (
             f"{len(short)} of {len(segmented.segments)} segments: less than {MIN_SAMPLES // 2} samples with these skews "
             f"and this period; the longest of them, from {first:.4g} s on, has {count}"
         )
-        if not segments:
+        if not times:
             raise file.error(f"{text}; a longer part is needed, or a shorter [log] resample")
         # channels may be resampled more than once
         if (note := f"Left out are {text}.") not in file.notes:
             file.notes.append(note)
-    return Grid(
-        np.concatenate(times), {name: np.concatenate(pieces) for name, pieces in values.items()}, tuple(segments), period
-    )
+    segments = slices_between(itertools.accumulate(map(len, times), initial=0))
+    return Grid(np.concatenate(times), {name: np.concatenate(pieces) for name, pieces in values.items()}, segments, period)
 
 
 def _common_times(
     file: LogFile, stamps: np.ndarray, period: float, delays: Iterable[Delay], first: float | None
 ) -> np.ndarray:
     """Return evenly spaced times at which all channels have values, s; on the grid from `first`, unless it is None."""
-    spans = [stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays]
-    begin, end = max(float(span[0]) for span in spans), min(float(span[1]) for span in spans)
+    begins, ends = np.transpose([stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays])
+    begin, end = float(begins.max()), float(ends.min())
     if first is not None:
         # the samples of channels without skew lie on this grid
         begin = first + period * math.ceil((begin - first) / period - 1e-6)

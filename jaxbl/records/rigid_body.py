@@ -32,7 +32,7 @@ class RigidFit:
         slowing: fall of the squared speed from begin to end of the segments, over their duration, rad²/s³ (m²/s³).
     """
 
-    names: tuple[str, ...]
+    names = "inertia", "viscous", "coulomb", "spring", "constant"
     values: np.ndarray
     errors: np.ndarray
     inflation: np.ndarray
@@ -71,44 +71,40 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         return None
     # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes
     cutoff = 3.0 * bandwidth
-    targets, all_rows, slowing = [], [], 0.0
+    parts = []
     for segment in long_segments(segments):
         smooth, velocity, acceleration = low_pass_motion(position[segment], cutoff, period)
         direction = low_pass(smooth_sign(velocity), cutoff, period)
         smooth_torque = low_pass(torque[segment], cutoff, period)
-        inner = trim_filter_ends(len(smooth), cutoff, period)
-        # the last column takes a lateness of the torque
-        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), np.gradient(smooth_torque, period)]
-        all_rows.append(np.stack(columns, axis=1)[inner])
-        slowing += float(velocity[inner][0] ** 2 - velocity[inner][-1] ** 2)
-        targets.append(smooth_torque[inner])
-    if not targets:
+        # the slope of the torque takes a lateness of it
+        slope = np.gradient(smooth_torque, period)
+        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), slope, smooth_torque]
+        parts.append(np.stack(columns, axis=1)[trim_filter_ends(len(smooth), cutoff, period)])
+    if not parts:
         return None
-    target, rows = np.concatenate(targets), np.concatenate(all_rows)
+    signals = np.concatenate(parts)
+    acceleration, velocity, target = signals[:, 0], signals[:, 1], signals[:, -1]
     # what holds a drive at rest is no function of its motion
-    moves = np.abs(rows[:, 1]) > MIN_SPEED_SHARE * rms(rows[:, 1])
-    if not moves.any() or np.ptp(target[moves]) == 0.0:
+    moving = signals[np.abs(velocity) > MIN_SPEED_SHARE * rms(velocity)]
+    rows, moving_target, terms = moving[:, :-1], moving[:, -1], moving[:, :5]
+    if not len(moving) or np.ptp(moving_target) == 0.0:
         return None
-    coefficients, errors = fit_with_jackknife(target[moves], rows[moves])
+    coefficients, errors = fit_with_jackknife(moving_target, rows)
     if not np.isfinite(coefficients).all():
         # two terms are proportional to each other
         coefficients, errors = np.zeros(6), np.full(6, np.inf)
-    terms = rows[moves, :5]
-    centred = terms[:, :4] - terms[:, :4].mean(axis=0)
     inflation = np.full(5, np.inf)
-    if np.isfinite(errors).all() and (column_rms(centred) > 0.0).all():
-        inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(centred.T))), 1.0)
-    residuals = (target - rows @ coefficients)[moves]
+    if np.isfinite(errors).all() and np.ptp(terms[:, :4], axis=0).all():
+        inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(terms[:, :4].T))), 1.0)
     return RigidFit(
-        names=("inertia", "viscous", "coulomb", "spring", "constant"),
         values=coefficients[:5],
         errors=errors[:5],
         inflation=inflation,
-        shares=np.abs(coefficients[:5]) * column_rms(terms) / rms(target[moves]),
-        residual=float(np.std(residuals) / np.std(target[moves])),
+        shares=np.abs(coefficients[:5]) * column_rms(terms) / rms(moving_target),
+        residual=float(np.std(moving_target - rows @ coefficients) / np.std(moving_target)),
         torque=rms(target),
-        acceleration=rms(rows[:, 0]),
-        power=float(np.mean(target * rows[:, 1])),
-        square=float(np.mean(rows[:, 1] ** 2)),
-        slowing=slowing / (len(rows) * period),
+        acceleration=rms(acceleration),
+        power=float(np.mean(target * velocity)),
+        square=float(np.mean(velocity**2)),
+        slowing=float(sum(part[0, 1] ** 2 - part[-1, 1] ** 2 for part in parts)) / (len(signals) * period),
     )

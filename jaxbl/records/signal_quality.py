@@ -1,6 +1,7 @@
 """Quality of sampled signals: resolution, noise, bandwidth, saturation, jumps."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,10 +125,10 @@ def saturated_share(values: np.ndarray, step: float) -> float:
     saturated = 0
     for extreme in (values.min(), values.max()):
         starts, stops = find_runs(np.abs(values - extreme) <= 0.5 * step)
-        lengths = stops - starts
+        lengths = (stops - starts)[stops - starts >= 5]
         # a single run may be a rest; a clipped signal comes back to the same value
-        if np.count_nonzero(lengths >= 5) >= 2:
-            saturated += int(lengths[lengths >= 5].sum())
+        if len(lengths) >= 2:
+            saturated += int(lengths.sum())
     return saturated / len(values)
 
 
@@ -144,12 +145,10 @@ def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = 
         differences = differences * (np.median(intervals) / intervals)
     deviation = np.abs(differences - median_filter(differences, 7, mode="nearest"))
     # spread of the motion nearby; the quantiles leave out an outlier or two
-    local_spread = percentile_filter(differences, 90, 31, mode="nearest") - percentile_filter(
-        differences, 10, 31, mode="nearest"
-    )
+    high, low = (percentile_filter(differences, percent, 31, mode="nearest") for percent in (90, 10))
     typical = 1.4826 * float(np.median(deviation))
     outliers = np.flatnonzero(
-        deviation > np.maximum(2.0 * local_spread, max(12.0 * typical, 4.5 * step, 1e-9 * float(np.ptp(positions))))
+        deviation > np.maximum(2.0 * (high - low), max(12.0 * typical, 4.5 * step, 1e-9 * float(np.ptp(positions))))
     )
     # an outlier spoils two differences
     return int(np.count_nonzero(np.diff(outliers, prepend=-10) > 2))
@@ -186,6 +185,11 @@ def interpolate_spline(times: np.ndarray, values: np.ndarray, new_times: np.ndar
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(times, values)(np.clip(new_times, times[0], times[-1]))
+
+
+def slices_between(edges: Iterable[int]) -> list[slice]:
+    """Return the slices from each edge to the next."""
+    return [slice(start, stop) for start, stop in itertools.pairwise(edges)]
 
 
 def segments_before(segments: Sequence[slice], end: int) -> list[slice]:

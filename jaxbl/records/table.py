@@ -87,7 +87,18 @@ class _ChannelTable(_ColumnTable):
         return self
 
 
-class PositionTable(_ChannelTable):
+class _MotionTable(_ChannelTable):
+    """Keys common to positions and speeds."""
+
+    unit: Any
+
+    @property
+    def si_unit(self) -> str:
+        """Unit of the position: m on a linear axis, else rad."""
+        return "m" if self.unit in ("m", "mm", "m/s", "mm/s") else "rad"
+
+
+class PositionTable(_MotionTable):
     """An encoder's column."""
 
     unit: Literal["rad", "deg", "turn", "counts", "m", "mm"] = Field(default="rad", description="unit of the column")
@@ -117,13 +128,8 @@ class PositionTable(_ChannelTable):
             raise table_error(f"counts_per_turn is for unit counts, not for {self.unit}")
         return self
 
-    @property
-    def si_unit(self) -> str:
-        """m on a linear axis, else rad."""
-        return "m" if self.unit in ("m", "mm") else "rad"
 
-
-class SpeedTable(_ChannelTable):
+class SpeedTable(_MotionTable):
     """A speed that was recorded in place of a position; the position is its integral."""
 
     unit: Literal["rad/s", "deg/s", "rpm", "turn/s", "m/s", "mm/s"] = Field(
@@ -135,11 +141,6 @@ class SpeedTable(_ChannelTable):
         "by how much the stamps are later than the readings, undone; left out: 0, of omega_s one that is sure",
         json_schema_extra=_SECONDS,
     )
-
-    @property
-    def si_unit(self) -> str:
-        """Unit of the integral: m on a linear axis, else rad."""
-        return "m" if self.unit in ("m/s", "mm/s") else "rad"
 
 
 class TorqueTable(_ChannelTable):

@@ -1,6 +1,5 @@
 """Time stamps of a log: the selected rows, gaps between them, and whether the stamps are even."""
 
-import itertools
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ from jaxbl.workers import check_cost
 
 from .files import LogFile, read_log_file
 from .libraries import Column, ColumnName, read_at
-from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment
+from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment, slices_between
 from .table import LogTable, TimeTable
 
 GAP_PERIODS = 3.5
@@ -191,9 +190,9 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
 
 def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
     """Tell which rows have a value in every channel: one that is logged less often has none in most rows."""
-    is_full = np.ones(count, dtype=bool)
-    for column in table.list_columns() - {*(table.absent or ())}:
-        if column in file.columns and file.count_values(column) == count:
+    is_full, needed_columns = np.ones(count, dtype=bool), table.list_columns() - {*(table.absent or ())}
+    for column in file.columns:
+        if column in needed_columns and file.count_values(column) == count:
             has_value = pd.notna(file.load_values(column))
             if has_value.sum() >= MIN_SAMPLES and not has_value.all():
                 is_full &= has_value
@@ -212,14 +211,10 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray, is_full: np
         column_values = file.load_values(file.find_column(column))
         is_selected &= column_values == required
         if not is_selected.any():
-            examples = ", ".join(
-                repr(v.item() if hasattr(v, "item") else v) for v in np.unique(column_values.astype(object))[:6]
-            )
+            examples = ", ".join(map(repr, np.unique(column_values.astype(object))[:6].tolist()))
             raise file.error(f"[log] where leaves no row: '{column}' is never {required!r}; values: {examples}")
-    for limit, is_outside in ((table.start, np.less), (table.stop, np.greater)):
-        if limit is not None:
-            is_selected &= ~is_outside(stamps, limit)
-    rows = np.flatnonzero(is_selected)
+    stop = np.inf if table.stop is None else table.stop
+    rows = np.flatnonzero(is_selected & (stamps >= (table.start or 0.0)) & (stamps <= stop))
     if len(rows) < MIN_SAMPLES:
         raise file.error(
             f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {MIN_SAMPLES} are needed"
@@ -240,25 +235,21 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         InputError: too few samples remain.
     """
     times, rows = stamps.times, stamps.rows
-    pieces = _split_at_intervals(times, stamps.max_interval)
-    segments = list(filter(_is_long_enough, pieces))
+    pieces, segments = _split_at_intervals(times, stamps.max_interval)
     fits = [fit_even_stamps(times[segment]) for segment in segments]
     # of parts with different periods none can be read with that of another; stamps may be rounded to a period
     is_even = all(
         fit.is_even and abs(fit.period / fits[0].period - 1.0) < 1e-3 + 1.0 / _count_samples(segment)
         for fit, segment in zip(fits, segments, strict=True)
     )
-    distinct = np.ones(len(times), dtype=bool)
-    if not is_even:
-        # a spline needs increasing stamps
-        distinct = np.diff(times, prepend=-1.0) != 0.0
+    # a spline needs increasing stamps
+    distinct = (np.diff(times, prepend=-1.0) != 0.0) | is_even
     repeated = len(times) - int(distinct.sum())
     if repeated:
         row = rows[int(np.argmin(distinct))] + 1
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
-        times, rows = times[distinct], rows[distinct]
-        pieces = _split_at_intervals(times, stamps.max_interval)
-        segments = list(filter(_is_long_enough, pieces))
+    times, rows = times[distinct], rows[distinct]
+    pieces, segments = _split_at_intervals(times, stamps.max_interval)
     samples = sum(map(_count_samples, segments))
     if samples < MIN_SAMPLES:
         longest_piece = max(map(_count_samples, pieces))
@@ -275,7 +266,6 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
             + (f"; {left_out} samples between gaps were left out." if left_out else ".")
         )
     within, period = intervals <= stamps.max_interval, stamps.median_interval
-    intervals_within = intervals[within]
     # stamps that are as coarse as the period say nothing
     lost = within * (np.round(intervals / period) - 1.0)
     off = within * (intervals - (lost + 1.0) * period)
@@ -285,14 +275,13 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
             f"{lost.sum():.0f} rows are missing, after data row {rows[first] + 1} first; they are interpolated."
         )
     if is_even:
-        times = times.copy()
         for piece, fit in zip(segments, fits, strict=True):
             times[piece] = fit.first + fit.period * np.arange(_count_samples(piece))
         period = fits[segments.index(longest_segment(segments))].period
     sampling = Sampling(
         samples=len(stamps.times),
         median_period=stamps.median_interval,
-        jitter=float(np.std(intervals_within)) if len(intervals_within) else 0.0,
+        jitter=float(np.std(intervals[within])),
         longest_interval=float(intervals.max()),
         gaps=len(pieces) - 1,
         repeated=repeated,
@@ -305,13 +294,11 @@ def _count_samples(segment: slice) -> int:
     return segment.stop - segment.start
 
 
-def _is_long_enough(segment: slice) -> bool:
-    return _count_samples(segment) >= MIN_SAMPLES // 2
-
-
-def _split_at_intervals(stamps: np.ndarray, max_interval: float) -> list[slice]:
+def _split_at_intervals(stamps: np.ndarray, max_interval: float) -> tuple[list[slice], list[slice]]:
+    """Return the pieces between longer intervals, and those of them that are long enough for a segment."""
     starts = np.flatnonzero(np.diff(stamps) > max_interval) + 1
-    return [slice(start, stop) for start, stop in itertools.pairwise([0, *starts.tolist(), len(stamps)])]
+    pieces = slices_between([0, *starts.tolist(), len(stamps)])
+    return pieces, [piece for piece in pieces if _count_samples(piece) >= MIN_SAMPLES // 2]
 
 
 class StampFit(NamedTuple):
@@ -329,9 +316,9 @@ def fit_even_stamps(stamps: np.ndarray) -> StampFit:
     period = float(index @ (stamps - middle) / (index @ index))
     deviation = float(np.abs(stamps - middle - period * index).max())
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
-    rounding = find_resolution(np.diff(stamps))
-    # a row or two that were lost or repeated are likelier than a period that is off by as much as their stamps say
     intervals = np.diff(stamps)
+    rounding = find_resolution(intervals)
+    # a row or two that were lost or repeated are likelier than a period that is off by as much as their stamps say
     irregular = np.count_nonzero(np.abs(intervals - np.median(intervals)) > 0.5 * period)
     is_rounded = irregular not in (1, 2) and deviation <= 0.55 * min(rounding, 20.0 * period)
     is_even = period > 0.0 and (deviation <= 0.02 * period or is_rounded)

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,13 +22,6 @@ _UNEXPLAINED = 0.55
 """Share of a torque that acceleration, velocity and direction do not explain at most, in a plain drive."""
 _ROUND = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0)
 """Digits of usual periods; degrees beside rad/s, or rad beside rpm, give others."""
-
-
-class MotionColumns(NamedTuple):
-    """Columns by channel, and the period in s by which the speed is the slope of the position; None if there is none."""
-
-    channels: dict[str, ColumnName]
-    period: float | None
 
 
 def rises_evenly(values: np.ndarray) -> bool:
@@ -61,15 +53,18 @@ def find_latest(signals: _Signals) -> ColumnName:
     return latest
 
 
-def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> MotionColumns:
+def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> tuple[dict[str, ColumnName], float | None]:
     """Guess positions and torque of a drive; the position is the smoothest column, the motor's side moves further.
 
     Args:
         signals: finite columns that move, shape (rows,) each.
         times: of the rows, in any unit; None if they are not known.
+
+    Returns:
+        Columns by channel, and the period in s by which the speed is the slope of the position; None if there is none.
     """
     if len({len(values) for values in signals.values()}) != 1:
-        return MotionColumns({}, None)
+        return {}, None
     is_timed = times is not None and times.dtype.kind in "iuf"
     period = float(np.median(np.diff(times))) if times is not None and is_timed else 1.0
     names = [*signals]
@@ -98,4 +93,4 @@ def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> M
             found_period = next((decade * digits for digits in _ROUND if abs(ratio / decade / digits - 1.0) < 0.01), None)
     if torques:
         channels["u"] = torques[min(torques)]
-    return MotionColumns(channels, found_period)
+    return channels, found_period

@@ -103,7 +103,7 @@ def test_it_is_told_with_its_interval(tmp_path):
 def test_too_little_tells_nothing():
     t = 0.01 * np.arange(400)
     for load in (t, np.sin(t), np.zeros(400)):
-        assert lost_motion.fit_lost_motion_by_load(t, 0.1 * np.sign(t - 2.0), load, np.gradient(load, t), None) is None
+        assert lost_motion.fit_lost_motion_by_load(t, 0.1 * np.sign(t - 2.0), load, np.gradient(load, t), np.inf) is None
 
 
 def test_a_real_servo_whose_load_was_turned_around():
