@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable
 from functools import lru_cache
 from itertools import cycle
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ from .panels import (
     mark,
     with_unit,
 )
-from .refined_maps import Filling, coarse_axes, on_coarse_values
+from .refined_maps import Filling
 
 
 def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
@@ -100,17 +101,18 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     # about four points in each bin of a map
     bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))
 
+    # of a refined study what lies on the coarse grid along all axes but those drawn
+    starts = {axis.path: axis.start for axis in config.axes if axis.path in (figure.x, figure.y)}
+
     def select(frame: DataFrame) -> DataFrame:
-        frame = on_coarse_values(points, frame, [figure.x, figure.y])
-        frame = filter_rows(frame, resolve_where(config, figure))
+        frame = filter_rows(frame[points.on_coarse_grid(frame.assign(**starts))], resolve_where(config, figure))
         for axis in random:
             middles = axis.model_copy(update={"num": 2 * bins + 1}).grid()[1::2]
             edges = cell_edges(middles, axis.scale == "log")[1:-1]
             frame = frame.assign(**{axis.path: middles[np.searchsorted(edges, frame[axis.path])]})
         return frame
 
-    needs = [*(figure.where or {}), *(axis.path for axis in random), *(columns if points.refinement else ())]
-    return Rows(result, columns, select, needs)
+    return Rows(result, columns, select)
 
 
 _WORDS = {
@@ -247,13 +249,11 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Ser
     if none did."""
     side = spec.x.split(".")[1]
     # most points of a refined study lie at its boundary: the median is that of the coarse grid
-    bounds = Column(
-        [f"{side}.converged", f"{side}.f_plus", "seed", *coarse_axes(points)],
-        lambda frame: frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame)),
-    )
-    converged = bounds._replace(of=lambda frame: bounds.of(frame).where(frame[f"{side}.converged"].astype(bool)))
+    def bounds(frame: DataFrame) -> Series:
+        return frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame))
+
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
-    medians = groups.medians(converged)
+    medians = groups.medians(lambda frame: bounds(frame).where(frame[f"{side}.converged"].astype(bool)))
     return medians.fillna(groups.medians(bounds)) if medians.isna().any() else medians
 
 
@@ -310,7 +310,7 @@ def _map_table(groups: Groups, sample: DataFrame, value: str) -> DataFrame:
     """The places of a map: `value`, whether it is none that means something (`failed`: too few of its runs converged, or
     one diverged), and the shares of runs that are `finite` and converged, of the columns that `sample` has."""
     converged, column = f"{value.partition('.')[0]}.converged", _drawn_column(value)
-    table = groups.means({name: _number_column(name) for name in ("finite", converged) if name in sample})
+    table = groups.means({name: itemgetter(name) for name in ("finite", converged) if name in sample})
     # one number for each group: the median over what else varies, or the share that is true
     middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.medians(column)
     # an average of the runs that did not diverge would hide that one did
@@ -338,31 +338,22 @@ def drawn_values(part: DataFrame, value: str) -> Series:
 
 
 def _drawn_column(value: str) -> Column:
-    return Column([value, "finite"], lambda frame: drawn_values(frame, value))
-
-
-def _number_column(name: str) -> Column:
-    return Column([name], lambda frame: frame[name].astype(float))
+    return lambda frame: drawn_values(frame, value)
 
 
 def worst_runs(groups: Groups, value: str, has_margin: bool) -> DataFrame:
     """The worst run of each group: its `error`, the least `margin_alpha` of observers that have one, the share that
     `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
     side, column = value.partition(".")[0], _drawn_column(value)
-    means = groups.means(
-        {
-            "converged": _number_column(f"{side}.converged"),
-            "mean": column,
-            "square": column._replace(of=lambda frame: column.of(frame) ** 2),
-        }
-    )
+    columns: dict[str, Column] = {"mean": column, "square": lambda frame: column(frame) ** 2}
+    means = groups.means(columns | {"converged": itemgetter(f"{side}.converged")})
     scatter = 0.0
     if not groups.varied - set(groups.index.names):
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
         scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
     if has_margin:
-        means["margin_alpha"] = groups.spread(_number_column(f"{side}.margin_alpha")).least
+        means["margin_alpha"] = groups.spread(itemgetter(f"{side}.margin_alpha")).least
     return means.assign(error=groups.spread(column).largest, scatter=scatter)
 
 

@@ -68,19 +68,3 @@ def _drawn_values(values: Array, cell: int) -> Array:
     while len(values) > _MOST_SHOWN * step and step < cell:
         step *= 2
     return values[::step]
-
-
-def coarse_axes(points: Points) -> dict[str, Array]:
-    """Values of the coarse grid along the refined axes, by path; none of a study that is not refined."""
-    if points.refinement is None:
-        return {}
-    stride = 1 << points.refinement.grid.depth
-    return {path: points.axis_values(path)[::stride] for path in points.refinement.paths}
-
-
-def on_coarse_values(points: Points, frame: DataFrame, drawn: list[str]) -> DataFrame:
-    """The rows of a refined study whose values are on the coarse grid along all axes but those drawn."""
-    for path, values in coarse_axes(points).items():
-        if path not in drawn:
-            frame = frame.loc[np.isin(frame[path], values)]
-    return frame
