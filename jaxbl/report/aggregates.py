@@ -69,13 +69,15 @@ class Groups:
     Attributes:
         index: values of the columns, a level each.
         varied: columns of the rows that have more than one value.
+        columns: all columns of the rows.
     """
 
     def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], further: Sequence[str] = ()):
         self._rows, self._keys = rows, list(keys)
         distinct, first = list[DataFrame](), {}
-        self.varied: set[str] = set()
+        self.varied, self.columns = set[str](), set[str]()
         for frame in rows:
+            self.columns |= {*frame}
             distinct.append(frame[self._keys].drop_duplicates())
             # seldom, as it goes through all that differ
             if sum(map(len, distinct[1:])) > len(distinct[0]) + 10_000:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import is_boolean
-from jaxbl.files import write_atomic, write_json
+from jaxbl.files import write_atomic
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 
@@ -32,11 +32,11 @@ _ROWS = 12
 
 
 def write(comparison: Comparison, folder: Path) -> str:
-    """Write `comparison.json`, the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
+    """Write the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
     tabulate_points(comparison).to_parquet(folder / "comparison.parquet")
-    write_atomic(folder / "study.toml", comparison.first_config.to_toml())
-    write_json(folder / "comparison.json", comparison.to_dict())
-    return comparison.first_config.to_toml()
+    study = comparison.first_config.to_toml()
+    write_atomic(folder / "study.toml", study)
+    return study
 
 
 def tabulate_points(comparison: Comparison) -> pd.DataFrame:

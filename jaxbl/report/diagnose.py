@@ -19,7 +19,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_table, write_fit
+from .numbers import lead_with_doubt, number_table, write as write
 from .panels import (
     BLUE,
     MISSING,
@@ -45,11 +45,6 @@ _CHANNELS = {
     "theta_e": "motor position", "theta_s": "load position", "velocity_motor": "motor speed", "velocity_load": "load speed",
     "torque_motor": "motor: missing torque", "torque_load": "load: missing torque",
 }  # fmt: skip
-
-
-def write(result: Diagnosis, folder: Path) -> str:
-    """Write `diagnosis.json`, `model.toml` and `trace.parquet`. Returns the TOML of the extended model."""
-    return write_fit(result, folder, "diagnosis")
 
 
 def describe(summary: JsonObject) -> Result:

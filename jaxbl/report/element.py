@@ -10,14 +10,14 @@ from jaxbl.lines import Lines, percent
 from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
-from .numbers import lead_with_doubt, number_figures, number_table, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write as write_fit
 from .panels import BLUE, ORANGE, Axis, Figure, Panel, Span, cloud, draw_signals, missing_quantity
 
 
 def write(result: ElementIdentification, folder: Path) -> str:
-    """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the TOML of the transmission."""
+    """Write `model.toml` and `trace.parquet`. Returns the TOML of the transmission."""
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(result.tables)
-    return write_fit(result, folder, "identification", model)
+    return write_fit(result, folder, model)
 
 
 def describe(summary: JsonObject) -> Result:

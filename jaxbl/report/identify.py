@@ -18,7 +18,7 @@ from jaxbl.records.signal_quality import longest_segment
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_figures, number_table, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write as write
 from .panels import (
     BLACK,
     GREEN,
@@ -39,11 +39,6 @@ from .panels import (
     missing_quantity,
     shade_gap,
 )
-
-
-def write(result: Identification, folder: Path) -> str:
-    """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the model's TOML."""
-    return write_fit(result, folder, "identification")
 
 
 def describe(summary: JsonObject) -> Result:

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from jaxbl.files import to_jsonable, write_json
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -31,8 +30,7 @@ _COLOURS = {"u": BLACK, "theta_e": BLUE, "theta_s": VERMILION, "transmitted": GR
 
 
 def write(inspection: Inspection, folder: Path) -> str:
-    """Write `inspection.json`. Returns the `[log]` table as TOML."""
-    write_json(folder / "inspection.json", to_jsonable(inspection.to_dict()))
+    """Return the `[log]` table as TOML."""
     return tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
 
 

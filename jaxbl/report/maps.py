@@ -157,17 +157,14 @@ def unit_of(config: Config, path: str) -> str:
     return "" if parameter is None else parameter.unit
 
 
-def with_value(config: Config, path: str, value: Any) -> str:
-    """Words for a value of an axis: in milli, micro, nano where that is small."""
+def with_value(config: Config, path: str | None, value: Any) -> str:
+    """Words for a value of an axis, in milli, micro, nano where that is small; "" of no axis."""
+    if path is None:
+        return ""
     unit = unit_of(config, path)
     small = unit and not isinstance(value, str) and 1e-9 <= abs(value) < 1e-2
     text = EngFormatter(unit).format_data(value) if small else f"{_text(value)} {unit}".rstrip()
     return f"{path_words(config, path)} {text}"
-
-
-def _part_name(config: Config, path: str | None, value: Any) -> str:
-    """Words for the value that a panel or a line is of; "" where there is one alone."""
-    return "" if path is None else with_value(config, path, value)
 
 
 def _text(value: Any) -> str:
@@ -248,6 +245,7 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Ser
     """The f_plus that conditions are drawn for: by panel, the median of the true bounds of its converged points, or of all
     if none did."""
     side = spec.x.split(".")[1]
+
     # most points of a refined study lie at its boundary: the median is that of the coarse grid
     def bounds(frame: DataFrame) -> Series:
         return frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame))
@@ -270,13 +268,12 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         unseen = [path for path in paths if path not in keys]
         filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec.facet)]
         groups = Groups(filled, keys, paths)
-    table, converged = _map_table(groups, next(iter(filled)), spec.value), f"{side}.converged"
+    table, converged = _map_table(groups, spec.value), f"{side}.converged"
     bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
     errors, judged = {}, re.search(r"rmse|chatter|convergence_time$", spec.value) and converged in table
     if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
         # of a refined study those that were simulated
-        has_margin = f"{side}.margin_alpha" in next(iter(filled))
-        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec.facet))
+        errors = dict(_split(worst_runs(simulated, spec.value), spec.facet))
     # what failed sets no colour
     table["shown"] = table["value"].where(~table["failed"])
     scale = colour_scale(table["shown"].to_numpy(float), value_label(spec.value), spec.scale)
@@ -301,16 +298,16 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
             alphas = (x if alpha_is_x else y).ends
             parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {bound:.3g} rad/s²")
-        title = "\n".join(filter(None, (_part_name(config, spec.facet, value), ",  ".join(filter(None, under)))))
+        title = "\n".join(filter(None, (with_value(config, spec.facet, value), ",  ".join(filter(None, under)))))
         drawn.append(Panel(x, y, parts, title))
     return drawn, f" and {path_words(config, spec.y)}{_over(config, groups.varied, spec)}."
 
 
-def _map_table(groups: Groups, sample: DataFrame, value: str) -> DataFrame:
+def _map_table(groups: Groups, value: str) -> DataFrame:
     """The places of a map: `value`, whether it is none that means something (`failed`: too few of its runs converged, or
-    one diverged), and the shares of runs that are `finite` and converged, of the columns that `sample` has."""
+    one diverged), and the shares of runs that are `finite` and converged, of the columns that there are."""
     converged, column = f"{value.partition('.')[0]}.converged", _drawn_column(value)
-    table = groups.means({name: itemgetter(name) for name in ("finite", converged) if name in sample})
+    table = groups.means({name: itemgetter(name) for name in ("finite", converged) if name in groups.columns})
     # one number for each group: the median over what else varies, or the share that is true
     middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.medians(column)
     # an average of the runs that did not diverge would hide that one did
@@ -341,10 +338,11 @@ def _drawn_column(value: str) -> Column:
     return lambda frame: drawn_values(frame, value)
 
 
-def worst_runs(groups: Groups, value: str, has_margin: bool) -> DataFrame:
+def worst_runs(groups: Groups, value: str) -> DataFrame:
     """The worst run of each group: its `error`, the least `margin_alpha` of observers that have one, the share that
     `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
     side, column = value.partition(".")[0], _drawn_column(value)
+    margin = f"{side}.margin_alpha"
     columns: dict[str, Column] = {"mean": column, "square": lambda frame: column(frame) ** 2}
     means = groups.means(columns | {"converged": itemgetter(f"{side}.converged")})
     scatter = 0.0
@@ -352,8 +350,8 @@ def worst_runs(groups: Groups, value: str, has_margin: bool) -> DataFrame:
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
         scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
-    if has_margin:
-        means["margin_alpha"] = groups.spread(itemgetter(f"{side}.margin_alpha")).least
+    if margin in groups.columns:
+        means["margin_alpha"] = groups.spread(itemgetter(margin)).least
     return means.assign(error=groups.spread(column).largest, scatter=scatter)
 
 
@@ -381,13 +379,13 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
     for facet, part in _split(table.reset_index(), spec.facet):
         parts = list[Part]()
         for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
-            x, name = line[spec.x], _part_name(config, spec.series, value)
+            x, name = line[spec.x], with_value(config, spec.series, value)
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
             parts.append(Line(x, line["middle"], name, colour, marker="o", size=3.5))
         x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
-        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _part_name(config, spec.facet, facet)))
+        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, with_value(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
 
 
@@ -407,7 +405,7 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
             ]
         x, _ = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
         panels.append(
-            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _part_name(config, spec.facet, facet))
+            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, with_value(config, spec.facet, facet))
         )
     seeds = config.sweep.seeds
     return panels, (

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 import tomli_w
 
-from jaxbl.files import to_jsonable, write_json
+from jaxbl.files import to_jsonable
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.quantity import QUANTITY_COLUMNS, Quantity
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -39,14 +39,12 @@ def lead_with_doubt(result: Result) -> Result:
     return replace(result, verdict="doubtful", headline=doubts[0].removeprefix(DOUBT), remarks=remarks)
 
 
-def write_fit(result: Any, folder: Path, name: str, model: str = "") -> str:
-    """Write `name.json`, `model.toml` and `trace.parquet` of a fit to a log into a folder that exists. Returns the model's
-    TOML."""
+def write(result: Any, folder: Path, model: str = "") -> str:
+    """Write `model.toml` and `trace.parquet` of a fit to a log into a folder that exists. Returns the model's TOML."""
     result.trace.to_parquet(folder / "trace.parquet", index=False)
     # that of a transmission alone is given
     model = model or format_model(result, folder / "trace.parquet")
     (folder / "model.toml").write_text(model, encoding="utf-8")
-    write_json(folder / f"{name}.json", result.summary)
     return model
 
 

@@ -158,8 +158,9 @@ def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
 
 
 def write(choice: ObserverChoice, folder: Path) -> str:
-    """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
-    return write_gains(choice, folder, observer_toml(choice.summary))
+    """Write `gains.toml` of a single point. Returns the study's TOML."""
+    gains = observer_toml(choice.summary)
+    return choice.config.to_toml() if gains is None else write_gains(choice, folder, gains)
 
 
 def describe(choice: ObserverChoice) -> Result:

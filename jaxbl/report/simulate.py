@@ -7,7 +7,6 @@ from typing import Any
 
 from pandas import DataFrame
 
-from jaxbl.files import write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
@@ -28,8 +27,7 @@ from .panels import (
 
 
 def write(trial: Trial, folder: Path) -> str:
-    """Write trace and summary of a run. Returns the study's TOML."""
-    write_json(folder / "summary.json", trial.summary)
+    """Write the trace of a run. Returns the study's TOML."""
     trial.trace.to_parquet(folder / "trace.parquet", index=False)
     return trial.config.to_toml()
 

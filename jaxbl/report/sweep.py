@@ -126,7 +126,7 @@ class _Survey:
             if error in metrics and side in self.sides and gains:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
                 groups = Groups(Rows(result, columns), gains, paths)
-                runs = worst_runs(groups, error, f"{side}.margin_alpha" in metrics)
+                runs = worst_runs(groups, error)
                 self.best[side] = best_gains(runs), runs
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxbl.files import write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
@@ -102,16 +101,14 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
 
 
 def write(tuning: Tuning, folder: Path) -> str:
-    """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
+    """Write `gains.toml` and certificates. Returns the study's TOML."""
     write_certificates(tuning.summary, folder)
     return write_gains(tuning, folder, gains_toml(tuning.summary))
 
 
-def write_gains(tuning: Any, folder: Path, gains: str | None) -> str:
-    """Write what `jaxbl tune` found, and gains as TOML, if there are any. Returns the study's TOML."""
-    if gains is not None:
-        (folder / "gains.toml").write_text(gains, encoding="utf-8")
-    write_json(folder / "tuning.json", tuning.summary, allow_nan=False)
+def write_gains(tuning: Any, folder: Path, gains: str) -> str:
+    """Write gains as TOML. Returns the study's TOML."""
+    (folder / "gains.toml").write_text(gains, encoding="utf-8")
     return tuning.config.to_toml()
 
 

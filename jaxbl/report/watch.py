@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import tomli_w
 
-from jaxbl.files import catch_write_errors, write_json
+from jaxbl.files import catch_write_errors
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
@@ -17,16 +17,14 @@ from .numbers import lead_with_doubt
 from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits
 
 VALUES = "watch.csv"
-SUMMARY = "watch.json"
 LABELS = {
     "half_gap": "half gap", "stiffness": "stiffness", "coulomb": "Coulomb friction", "viscous": "viscous friction",
 }  # fmt: skip
 
 
 def write(watch: Watch, folder: Path) -> str:
-    """Write `watch.csv` and `watch.json`. Returns the study's TOML."""
+    """Write `watch.csv`. Returns the study's TOML."""
     watch.values.to_csv(folder / VALUES, index=False)
-    write_json(folder / SUMMARY, watch.summary)
     return tomli_w.dumps(watch.task.config.to_dict())
 
 
