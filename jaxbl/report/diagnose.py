@@ -18,7 +18,7 @@ from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records.least_squares import rms
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .motor_alone_figures import draw_motor_alone
+from .identify import draw_motor_alone
 from .numbers import lead_with_doubt, number_table, write as write
 from .panels import (
     BLUE,
@@ -32,7 +32,6 @@ from .panels import (
     Figure,
     Line,
     Panel,
-    Part,
     Span,
     cloud,
     intervals,
@@ -40,7 +39,6 @@ from .panels import (
     with_unit,
 )
 
-_BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
     "theta_e": "motor position", "theta_s": "load position", "velocity_motor": "motor speed", "velocity_load": "load speed",
     "torque_motor": "motor: missing torque", "torque_load": "load: missing torque",
@@ -50,8 +48,8 @@ _CHANNELS = {
 def describe(summary: JsonObject) -> Result:
     """Say what the model lacks, how sure that is, and how much better it is with it, from a `diagnosis.json`."""
     verdict, headline = _verdict(summary)
-    tables = [_history_table(summary)] * bool(summary["history"])
-    tables += [
+    tables = [
+        *[_history_table(summary)] * bool(summary["history"]),
         _gap_table(summary["gap"]),
         number_table("Parameters of the model", read_quantities(summary["parameters"])),
     ]
@@ -249,9 +247,9 @@ def _failed_checks(summary: JsonObject) -> Lines:
 
 def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
     """Return of each channel the failed test that shows it best, its error and limit."""
-    errors, best = _errors_of_channels(gap), dict[str, tuple[str, Any, Any]]()
+    errors, best = _errors_of_channels(gap), {}
     tests = [(name, errors[name][1], errors[name][3]) for name in gap["test"]["failed"]]
-    for test in sorted(tests, key=lambda test: _ratio(*test[1:]), reverse=True):
+    for test in sorted(tests, key=lambda test: -_ratio(*test[1:])):
         best.setdefault(test[0].split()[0], test)
     return [*best.values()]
 
@@ -277,10 +275,8 @@ def rms_text(value: float | None) -> str:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines = []
-    if summary["verdict"] != "unknown_effect" or summary["findings"]:
-        lines += [f"Residual of the model as given: {side['sentence']}." for side in summary["where"].values()]
-    return [*lines, *summary["notes"]]
+    where = summary["where"] if summary["verdict"] != "unknown_effect" or summary["findings"] else {}
+    return [*(f"Residual of the model as given: {side['sentence']}." for side in where.values()), *summary["notes"]]
 
 
 def _ratio(error: float | None, other: float | None) -> float:
@@ -336,8 +332,13 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
         for before, after, held in pieces:
             if held and not all(other for _, _, other in pieces):
                 parts.append(Span(before.time[0], before.time[-1], "held out", ORANGE, opacity=0.18))
-            parts += torque_parts(before, bandwidth, "before", noise=False, colour=_BEFORE, width=2.6, opacity=0.6)
-            parts += torque_parts(after, bandwidth, "after", colour=_AFTER, width=0.9)
+            # behind the low-pass that the analysis used
+            (first, _), (last, _) = (narrow(residual, bandwidth) for residual in (before, after))
+            parts += [
+                Line(first.time, first.torque, "before", VERMILION, 2.6, opacity=0.6),
+                Band(last.time, -2.0 * last.deviation, 2.0 * last.deviation, "± 2 noise", MISSING, 0.75),
+                Line(last.time, last.torque, "after", BLUE, 0.9),
+            ]
         panels.append(Panel(TIME, Axis(missing_label(f"{side}:\n", unit)), parts))
     lead = f"Held-out log {diagnosis.holdout.path.name}: t" if diagnosis.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
@@ -350,13 +351,6 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
 """Coordinates that are drawn: as many as are wide enough side by side."""
-
-
-def torque_parts(residual: Residual, bandwidth: float, name: str, *, noise: bool = True, **how: Any) -> list[Part]:
-    """A residual over time behind the low-pass that the analysis used, and its noise as a band."""
-    low, _ = narrow(residual, bandwidth)
-    band = [Band(low.time, -2.0 * low.deviation, 2.0 * low.deviation, "± 2 noise", MISSING, 0.75)]
-    return [*band * noise, Line(low.time, low.torque, name, **how)]
 
 
 def draw_residual(
@@ -377,7 +371,7 @@ def draw_residual(
     lows, rows = zip(*(narrow(part, located.bandwidth) for part in parts), strict=True)
     torque = np.concatenate([low.torque for low in lows])
     noise = rms(np.concatenate([low.deviation for low in lows]))
-    limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
+    limit = 1.15 * max(np.quantile(np.abs(torque), 0.998), 2.5 * noise)
     y, panels = Axis(missing_label(f"{located.name}: ", unit), ends=(-limit, limit)), []
     for name in sorted(drawn, key=names.index):
         coordinate = by_name[name]

@@ -61,6 +61,8 @@ _SETTINGS: Any = {
     "figure.constrained_layout.use": True,
     "savefig.dpi": 150,
     "svg.fonttype": "path",
+    # names are no mathematics
+    "text.parse_math": False,
 }
 _NAME, _HALO, _NAME_SIZE = "#111111", "#fefefe", 8.5
 """Of names that are written along lines: colours, and size in points."""
@@ -163,8 +165,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     foot = height + 0.1 if below else 0.0
     canvas = Canvas(figsize=(figure.width, figure.height * rows + foot), layout="none")  # pyright: ignore[reportArgumentType]
     grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*[1.0] * columns, *[0.035 * columns] * shared])
-    axes: list[Axes] = []
-    axes_by_axis: dict[tuple[str, Axis], Axes] = {}
+    axes, axes_by_axis = [], dict[tuple[str, Axis], Axes]()
     for i, panel in enumerate(panels):
         how = {f"share{name}": axes_by_axis.get((name, axis)) for name, axis in panel.axes.items() if axis.label}
         ax = canvas.add_subplot(grid[i // columns, i % columns], **how)
@@ -172,7 +173,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
         axes.append(ax)
         _draw_panel(ax, panel)
         above = 0.0 if below else _legend_above(ax, names[i], figure.width / columns)
-        ax.set_title(_plain(panel.title), loc="left", pad=6.0 + 72.0 * above)
+        ax.set_title(panel.title, loc="left", pad=6.0 + 72.0 * above)
         # the panels below and on the left, on which the same axis stands
         neighbours = {"x": panels[i + columns :][:1], "y": panels[i - 1 : i] if i % columns else ()}
         for name, axis in panel.axes.items():
@@ -185,7 +186,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     if shared:
         _draw_bar(canvas, scales[0], cax=canvas.add_subplot(grid[:, columns]))
     if below:
-        canvas.legend(below.values(), map(_plain, below), loc="lower center", ncols=fit)
+        canvas.legend(below.values(), below, loc="lower center", ncols=fit)
     # before each drawing: what writes SVG would lay out anew, without room for the legend below
     canvas.set_layout_engine(TightLayoutEngine(pad=0.5, rect=(0.0, foot / canvas.get_figheight(), 1.0, 1.0)))
     return canvas, axes
@@ -195,11 +196,6 @@ def _scales(panels: Sequence[Panel]) -> list[Scale]:
     """Scales of maps that have a colour bar."""
     parts = itertools.chain(*(panel.parts for panel in panels))
     return list(dict.fromkeys(part.scale for part in parts if isinstance(part, Map) and part.scale.label))
-
-
-def _plain(text: str) -> str:
-    """A text without mathematical type."""
-    return text.replace("$", r"\$")
 
 
 def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
@@ -213,13 +209,13 @@ def _legend_above(ax: Axes, handles: dict[str, Any], width: float) -> float:
     fit, height = _size_legend(handles, width - 0.6)
     place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
     if handles:
-        ax.legend(handles.values(), map(_plain, handles), ncols=fit, **place)
+        ax.legend(handles.values(), handles, ncols=fit, **place)
     return height
 
 
 def _draw_bar(canvas: Canvas, scale: Scale, **where: Any) -> None:
     """Draw the colour bar of a scale."""
-    label = "\n".join(textwrap.wrap(_plain(scale.label), 44))
+    label = "\n".join(textwrap.wrap(scale.label, 44))
     bar = canvas.colorbar(ScalarMappable(_norm(scale), scale.colours), label=label, **where)
     bar.outline.set_visible(False)  # type: ignore[operator]
     if scale.log:
@@ -240,7 +236,7 @@ def _set_log_ticks(axis: Any, low: float, high: float) -> None:
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     """Draw the parts of a panel, and set up its axes."""
     for name, axis in panel.axes.items():
-        ax.set(**{f"{name}label": _plain(axis.label), f"{name}scale": "log" if axis.log else "linear"})
+        ax.set(**{f"{name}label": axis.label, f"{name}scale": "log" if axis.log else "linear"})
         if axis.ends is not None:
             ax.set(**{f"{name}lim": axis.ends})
     box = ax.get_position()
@@ -248,14 +244,14 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     ticks = {"x": int(np.clip(1.4 * width * box.width, 2, 8)), "y": int(np.clip(2.5 * height * box.height, 2, 6))}
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
-        _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
+        _DRAWERS[type(part)](ax, thin(part), 1.0 + layer / len(panel.parts))
     _name_lines(ax, [part for part in panel.parts if isinstance(part, Line) and part.at_line and len(part.x) > 1])
     ax.grid(not any(isinstance(part, Map) for part in panel.parts))
     for name, axis in panel.axes.items():
         drawn = getattr(ax, f"{name}axis")
         if axis.names:
             places, texts = zip(*axis.names, strict=True)
-            drawn.set_ticks(places, map(_plain, texts))
+            drawn.set_ticks(places, texts)
             drawn.grid(False)
         elif axis.log:
             _set_log_ticks(drawn, *getattr(ax, f"get_{name}lim")())
@@ -282,7 +278,6 @@ def _line_look(line: Line) -> dict[str, Any]:
 
 
 def _draw_line(ax: Axes, line: Line, layer: float) -> None:
-    line = thin(line)  # type: ignore[assignment]
     if line.held:
         x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
         line = line._replace(x=x, y=y)
@@ -293,7 +288,7 @@ def _draw_line(ax: Axes, line: Line, layer: float) -> None:
     centred: Any = {"ha": "center", "va": "center"}
     beside: Any = {"va": "center", "xytext": (6, 0), "textcoords": "offset points"}
     for x, y, text in zip(line.x, line.y, line.texts):  # noqa: B905
-        ax.annotate(_plain(text), (x, y), fontsize=8, zorder=6, **(beside if line.marker else centred))
+        ax.annotate(text, (x, y), fontsize=8, zorder=6, **(beside if line.marker else centred))
 
 
 def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
@@ -314,7 +309,7 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
             i = int(np.argmax(worth))
             turn = float(np.arctan2(*(last - first)[i, ::-1]))
             name = ax.annotate(
-                _plain(line.name), tuple(ax.transData.inverted().transform(middle[i])),
+                line.name, tuple(ax.transData.inverted().transform(middle[i])),
                 (-3.0 * np.sin(turn), 3.0 * np.cos(turn)),
                 textcoords="offset points", fontsize=_NAME_SIZE, ha="center", va="bottom", zorder=6, color=_NAME,
                 rotation=np.degrees(turn), rotation_mode="anchor",
@@ -332,7 +327,6 @@ def _follow(ax: Axes, line: Line) -> np.ndarray:
 
 
 def _draw_band(ax: Axes, band: Band, layer: float) -> None:
-    band = thin(band)  # type: ignore[assignment]
     ax.fill_between(band.x, band.low, band.high, color=band.colour, alpha=band.opacity, lw=0.0, zorder=layer)
 
 
@@ -356,7 +350,7 @@ def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
 def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
     ax.barh(bars.places, bars.lengths, bars.thickness, color=bars.colour, alpha=bars.opacity, zorder=layer)
     for place, length, text in zip(bars.places, bars.lengths, bars.texts):  # noqa: B905
-        ax.annotate(f" {_plain(text)}", (length, place), va="center", fontsize=9)
+        ax.annotate(f" {text}", (length, place), va="center", fontsize=9)
 
 
 _DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _draw_map, Bars: _draw_bars}

@@ -56,7 +56,7 @@ def gain_axes(bound: float, alphas: Pair, lambdas: Pair) -> tuple[Axis, Axis]:
     """Axes of alpha (rad/s²) along x and lambda (√rad/s) along y; on the other sides stand α / f⁺ and λ / √f⁺."""
     return (
         Axis("α, switching gain (rad/s²)", log=True, ends=alphas, ratio=(bound, "α / f⁺")),
-        Axis("λ, correction gain (√rad/s)", log=True, ends=lambdas, ratio=(float(np.sqrt(bound)), "λ / √f⁺")),
+        Axis("λ, correction gain (√rad/s)", log=True, ends=lambdas, ratio=(np.sqrt(bound), "λ / √f⁺")),
     )
 
 

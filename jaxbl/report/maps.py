@@ -142,7 +142,7 @@ def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -
     """An axis of a figure that shows the cells about some values of a study's axis, and their edges."""
     log = is_log(config, path, values) if log is None else log
     edges = cell_edges(values, log)
-    return Axis(axis_label(config, path), path, log, (float(edges[0]), float(edges[-1]))), edges
+    return Axis(axis_label(config, path), path, log, (edges[0], edges[-1])), edges
 
 
 def axis_words(config: Config, path: str) -> dict[str, str]:
@@ -204,12 +204,12 @@ def colour_scale(values: Array, label: str, scale: str) -> Scale:
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return Scale(0.0, 1.0, label)
-    low, high = map(float, (finite.min(), finite.max()))
+    low, high = finite.min(), finite.max()
     if low == high or flat_remark(values):
         return Scale(low - 0.5 * abs(low) - 1e-12, high + 0.5 * abs(high) + 1e-12, label)
     if (scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0)) and high > 0.0:
         # it begins at the smallest positive value
-        return Scale(float(finite[finite > 0.0].min()), high, label, log=True)
+        return Scale(finite[finite > 0.0].min(), high, label, log=True)
     return Scale(low, high, label)
 
 
@@ -294,7 +294,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
             parts.append(mark(*place[::-1], "best", size=13.0))
             under.append(f"best ★ {part['value'][place]:.2g} {find_metric(spec.value).unit}".rstrip())
         if bounds is not None:
-            bound, alpha_is_x = float(bounds[i]), spec.x.endswith(".alpha")
+            bound, alpha_is_x = bounds[i], spec.x.endswith(".alpha")
             alphas = (x if alpha_is_x else y).ends
             parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {bound:.3g} rad/s²")

@@ -1,6 +1,6 @@
 """Numbers that were found in a log: as key figures, as rows of a table, and as files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,13 @@ def number_figures(numbers: Mapping[str, Quantity]) -> list[KeyFigure]:
     return [KeyFigure(str(numbers[path]), path) for path in first]
 
 
-def number_table(heading: str, numbers: Mapping[str, Quantity]) -> ResultTable:
-    """Table of numbers by path, without columns that would be empty."""
-    rows = [[path, *number.row()] for path, number in numbers.items()]
-    table = pd.DataFrame(rows, columns=["path", *QUANTITY_COLUMNS]).dropna(axis=1, how="all")
+def number_table(
+    heading: str, numbers: Mapping[str, Quantity], profiles: Mapping[str, Sequence[float] | None] = {}
+) -> ResultTable:
+    """Table of numbers by path, with intervals by profile likelihood, and without columns that would be empty."""
+    rows = [[path, *number.row(), *(profiles.get(path) or (None, None))] for path, number in numbers.items()]
+    columns = ["path", *QUANTITY_COLUMNS, "by profile from", "to"]
+    table = pd.DataFrame(rows, columns=columns).dropna(axis=1, how="all")
     return ResultTable(heading, list(table), to_jsonable(table.to_numpy()))
 
 

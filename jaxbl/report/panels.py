@@ -289,7 +289,7 @@ def limits(*values: Any, inside: Sequence[float] = ()) -> Pair | None:
     ends = [*np.quantile(finite, [0.001, 0.999]), *inside]
     low, high = min(ends), max(ends)
     margin = 0.12 * (high - low) or 1e-12 + 0.1 * abs(high)
-    return float(low - margin), float(high + margin)
+    return low - margin, high + margin
 
 
 def round_ticks(low: float, high: float) -> list[float]:
@@ -335,7 +335,7 @@ def literal(name: str) -> str:
     return shorten(escape_unprintable(name), _LONGEST_NAME)
 
 
-_LARGEST = float(np.finfo(np.float32).max)
+_LARGEST = np.finfo(np.float32).max
 
 
 def pack_numbers(values: Any) -> str:

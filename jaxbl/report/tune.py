@@ -49,7 +49,7 @@ def _map(tuning: Tuning, side: str) -> Figure:
     grid, failed = error.to_numpy(float), ~(feasible.to_numpy() >= 0.5)
     values = np.where(failed, np.nan, grid)
     x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
-    alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
+    alphas, lambdas = ((edges[0], edges[-1]) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
     parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
     # on the study's own excitation
