@@ -11,11 +11,11 @@ import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from tempfile import TemporaryFile
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from pandas import DataFrame, Series
+from pandas import DataFrame
 
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -49,14 +49,6 @@ class Rows:
     def frame(self) -> DataFrame:
         """All of them at once."""
         return pd.concat(map(self.changed, self.result.batches(self.columns)), ignore_index=True)
-
-
-class Spread(NamedTuple):
-    """Numbers of each group `(groups,)`, NaN left out."""
-
-    least: Array
-    median: Array
-    largest: Array
 
 
 Column = Callable[[DataFrame], Any]
@@ -123,12 +115,8 @@ class Groups:
             means = dict(zip(columns, sums / counts, strict=True))
         return DataFrame({"rows": rows, **means}, index=self.index)
 
-    def medians(self, column: Column) -> Series:
-        """The median of a column in each group."""
-        return Series(self.spread(column).median, self.index)
-
-    def spread(self, column: Column) -> Spread:
-        """The spread of a column's numbers in each group; NaN where it has none."""
+    def spread(self, column: Column) -> DataFrame:
+        """The `least`, `median` and `largest` of a column's numbers by group, NaN left out; NaN where a group has none."""
         count = np.zeros(len(self), np.int64)
         for groups, _ in self._numbers(column):
             count += np.bincount(groups, minlength=len(self))
@@ -149,4 +137,4 @@ class Groups:
             # the median lies between two ranks; a group without numbers has the one behind all others
             ranks = (np.where(count == 0, total, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
             least, below, above, largest = (grouped[rank] for rank in ranks)
-        return Spread(least, 0.5 * (below + above), largest)
+        return DataFrame({"least": least, "median": 0.5 * (below + above), "largest": largest}, self.index)

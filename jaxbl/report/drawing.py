@@ -363,10 +363,10 @@ def _legend_handles(panel: Panel) -> dict[str, Any]:
         is_hidden = part.at_line if isinstance(part, Line) else isinstance(part, Map) and not np.any(part.failed)
         if is_hidden or not part.name or part.name in handles:
             continue
+        if isinstance(part, Span) and part.low == part.high:
+            part = Line([], [], part.name, part.colour, part.width, part.dashes)
         if isinstance(part, Line):
             handles[part.name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
-        elif isinstance(part, Span) and part.low == part.high:
-            handles[part.name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
         else:
             handles[part.name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
     return handles

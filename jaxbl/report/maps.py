@@ -251,8 +251,8 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Ser
         return frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame))
 
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
-    medians = groups.medians(lambda frame: bounds(frame).where(frame[f"{side}.converged"].astype(bool)))
-    return medians.fillna(groups.medians(bounds)) if medians.isna().any() else medians
+    medians = groups.spread(lambda frame: bounds(frame).where(frame[f"{side}.converged"].astype(bool)))["median"]
+    return medians.fillna(groups.spread(bounds)["median"]) if medians.isna().any() else medians
 
 
 def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> tuple[list[Panel], str]:
@@ -309,7 +309,7 @@ def _map_table(groups: Groups, value: str) -> DataFrame:
     converged, column = f"{value.partition('.')[0]}.converged", _drawn_column(value)
     table = groups.means({name: itemgetter(name) for name in ("finite", converged) if name in groups.columns})
     # one number for each group: the median over what else varies, or the share that is true
-    middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.medians(column)
+    middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.spread(column)["median"]
     # an average of the runs that did not diverge would hide that one did
     table["value"] = middle if value == "finite" else middle.where(table["finite"] == 1.0)
     table["failed"] = table["value"].isna()
@@ -351,8 +351,8 @@ def worst_runs(groups: Groups, value: str) -> DataFrame:
             variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
         scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
     if margin in groups.columns:
-        means["margin_alpha"] = groups.spread(itemgetter(margin)).least
-    return means.assign(error=groups.spread(column).largest, scatter=scatter)
+        means["margin_alpha"] = groups.spread(itemgetter(margin))["least"]
+    return means.assign(error=groups.spread(column)["largest"], scatter=scatter)
 
 
 def best_gains(runs: DataFrame) -> BestGains | None:
@@ -371,11 +371,10 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
     groups = Groups(rows, keys, config.axis_paths)
     column = _drawn_column(spec.value)
     spread = groups.spread(column)
-    table = groups.means({"middle": column}).assign(least=spread.least, largest=spread.largest)
-    if not is_boolean(spec.value):
-        table["middle"] = spread.median
+    table = groups.means({"mean": column}).join(spread)
     band, drawn = "", []
-    scale = colour_scale(np.concatenate([spread.least, spread.largest]), value_label(spec.value), spec.scale)
+    scale = colour_scale(spread.to_numpy(), value_label(spec.value), spec.scale)
+    middle = "mean" if is_boolean(spec.value) else "median"
     for facet, part in _split(table.reset_index(), spec.facet):
         parts = list[Part]()
         for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
@@ -383,7 +382,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
-            parts.append(Line(x, line["middle"], name, colour, marker="o", size=3.5))
+            parts.append(Line(x, line[middle], name, colour, marker="o", size=3.5))
         x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
         drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, with_value(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
@@ -392,16 +391,18 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
 def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Panel], str]:
     """Points of lines that theory gives a slope for, with the lines fitted; a line without a law has its name."""
     panels = []
-    for facet in dict.fromkeys(spec.facet and law.where[spec.facet] for law in laws):
-        parts, members = list[Part](), [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
+    for facet in dict.fromkeys(law.where.get(spec.facet) for law in laws):
+        parts, members = list[Part](), [law for law in laws if law.where.get(spec.facet) == facet]
         for law, colour in zip(members, cycle(COLOURS), strict=False):
             lead = "".join(f"{_text(value)}: " for value in law.series.values())
-            name = lead + ("no law" if law.fit is None else slope_text(law.fit))
-            y = np.where(law.y_values > 0.0, law.y_values, np.nan)
-            ends = [] if law.fit is None else law.x_values[[law.fit.first, law.fit.last]]
+            slope, x, y = "no law", [], []
+            if law.fit is not None:
+                slope, x = slope_text(law.fit), law.x_values[[law.fit.first, law.fit.last]]
+                y = law.fit(x)
+            errors = np.where(law.y_values > 0.0, law.y_values, np.nan)
             parts += [
-                Line(law.x_values, y, colour=colour, width=0.0, marker="o", size=3.5),
-                Line(ends, ends if law.fit is None else law.fit(ends), name, colour),
+                Line(law.x_values, errors, colour=colour, width=0.0, marker="o", size=3.5),
+                Line(x, y, lead + slope, colour),
             ]
         x, _ = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
         panels.append(

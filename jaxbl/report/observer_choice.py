@@ -79,7 +79,9 @@ def _lost_kinds(kinds: JsonObject) -> list[str]:
 
 
 def _ratio(result: JsonObject) -> str:
-    """The ratio, with its interval if runs differ; more digits where it would read as one."""
+    """The ratio, with its interval if runs differ; more digits where it would read as one; a dash of none."""
+    if result["ratio"] is None:
+        return "–"
     ratio, low, high = (f"{result[key]:.{3 if abs(result[key] - 1.0) > 0.005 else 6}g}" for key in _RATIO)
     return ratio if runs_are_equal(result) else f"{ratio} ({low} to {high})"
 
@@ -259,9 +261,8 @@ def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
         rows = []
         for point in points:
             result = point["sides"][side]
-            ratios = ["–" if (numbers := result["kinds"][kind])["ratio"] is None else _ratio(numbers) for kind in kinds]
-            values, tied = (point["values"][path] for path in axes), ", ".join(result["not_told_apart"])
-            rows.append([*values, result["best"] or "none", tied, *ratios])
+            values, ratios = (point["values"][path] for path in axes), (_ratio(result["kinds"][kind]) for kind in kinds)
+            rows.append([*values, result["best"] or "none", ", ".join(result["not_told_apart"]), *ratios])
         columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
         tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
     return tables

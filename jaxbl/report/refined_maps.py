@@ -43,7 +43,12 @@ class Filling:
 
     def fill(self, table: DataFrame) -> DataFrame:
         """A table over (y, x) on the whole plane: rows of the nearest places, NaN where there is none."""
-        plane = pd.MultiIndex.from_product([_drawn_values(*axis) for axis in self._axes.values()], names=[*self._axes])
+        # all values of an axis, or every 2nd, 4th, ...
+        drawn = [
+            values[:: min(1 << ((len(values) - 1) // _MOST_SHOWN).bit_length(), cell)]
+            for values, cell in self._axes.values()
+        ]
+        plane = pd.MultiIndex.from_product(drawn, names=[*self._axes])
         nearest = self._nearest(table.index.to_frame(), plane.to_frame())
         return table.reset_index(drop=True).reindex(nearest).set_axis(plane)
 
@@ -60,11 +65,3 @@ class Filling:
             there = nearest < len(part)
             parts.append(part.iloc[nearest[there]].assign(**vertices[there].to_dict("list")))
         return pd.concat(parts, ignore_index=True)
-
-
-def _drawn_values(values: Array, cell: int) -> Array:
-    """Values of an axis that a figure shows: all, or every 2nd, 4th, ..."""
-    step = 1
-    while len(values) > _MOST_SHOWN * step and step < cell:
-        step *= 2
-    return values[::step]

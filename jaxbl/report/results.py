@@ -60,13 +60,9 @@ def _log(result: Any) -> Subject:
     return log_subject(Path(result.summary["file"]))
 
 
-def _find_result_type(report: Any) -> type:
-    """Find the type of the results that a module reports on: of the argument of its `draw`."""
-    return next(iter(report.draw.__annotations__.values()))
-
-
-_KINDS = {
-    _find_result_type(kind.report): kind
+# by the type of the result, which is the argument of its module's `draw`
+_KINDS: dict[type, _Kind] = {
+    next(iter(kind.report.draw.__annotations__.values())): kind
     for kind in (
         _Kind(simulate, "summary.json"),
         _Kind(sweep),

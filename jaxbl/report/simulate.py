@@ -45,7 +45,7 @@ def describe(trial: Trial) -> Result:
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
     quantities = [*itertools.product(sides, ("velocity", "torque"))]
     if trial.config.controller is not None:
-        quantities.append((trial.config.controller.side, "following"))
+        quantities += [(trial.config.controller.side, "following")]
     figures = []
     for side, quantity in quantities:
         error, largest = metrics[f"{side}.{quantity}_rmse"], limits.velocity_tolerance / drive.ratio(side)

@@ -33,20 +33,19 @@ def write(result: StudyResult, folder: Path) -> str:
 
 def describe(result: StudyResult) -> Result:
     """Say where the observers work, and which gains are best, with tables of axes that matter and of laws."""
-    survey, laws = _Survey(result), laws_of(result)
-    tables = [_law_table(laws)] * bool(laws)
-    tables += (_importance_table(side, ranked) for side, ranked in survey.importance.items())
-    answer = answer_sweep(result, survey)
+    answer, laws = answer_sweep(result), laws_of(result)
+    if not laws:
+        return answer
     # the table says which
     agreeing = (
         f"Accuracy laws: {sum(law.agrees for law in laws)} of {len(laws)} have a slope within {AGREEMENT:g} of theory."
     )
-    return replace(answer, remarks=[*answer.remarks, *[agreeing] * bool(laws)], tables=tables)
+    return replace(answer, remarks=[*answer.remarks, agreeing], tables=[_law_table(laws), *answer.tables])
 
 
-def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result:
-    """Say where the observers work, and which gains are best."""
-    config, survey, remarks = result.config, survey or _Survey(result), []
+def answer_sweep(result: StudyResult) -> Result:
+    """Say where the observers work, and which gains are best, with tables of axes that matter."""
+    config, survey, remarks = result.config, _Survey(result), []
     finished = result.is_finished(survey.runs)
     if not finished:
         remarks.append(f"The study is not finished: it has {result.runs} runs so far. Go on with 'jaxbl sweep'.")
@@ -60,7 +59,15 @@ def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result
     verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
     figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
-    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes)
+    tables = [
+        ResultTable(
+            f"{side}: which axis matters for the velocity error",
+            ["axis", "by itself", "with others"],
+            [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked],
+        )
+        for side, ranked in survey.importance.items()
+    ]
+    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes, tables)
 
 
 def _best_figures(side: str, best: BestGains | None, runs: pd.DataFrame) -> Iterator[KeyFigure]:
@@ -78,11 +85,6 @@ def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
     share, way = (axis.alone, "") if axis.total is None else (axis.total, " and what it does together with others")
     text = f"of the {side} observer's velocity error goes with {axis.path}{way} (share of the variance of its logarithm)"
     return KeyFigure(_share(share), text)
-
-
-def _importance_table(side: str, ranked: list[AxisImportance]) -> ResultTable:
-    rows = [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked]
-    return ResultTable(f"{side}: which axis matters for the velocity error", ["axis", "by itself", "with others"], rows)
 
 
 def _share(share: tuple[float, float] | None) -> str:

@@ -123,7 +123,7 @@ def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
         works, sizes = (array[:: max(array.size // _MOST_JUDGED, 1)] for array in part)
         works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes)])
         share = float(np.mean(works)) if works.size and values is not cells[first] else 0.0
-        spread = np.std(np.log(sizes[sizes > 0.0])) if np.any(sizes > 0.0) else 0.0
+        spread = float(np.std(np.log(sizes[sizes > 0.0]))) if np.any(sizes > 0.0) else 0.0
         # tenths: of slices with about the same border that with the larger spread
         return round(10.0 * min(share, 1.0 - share)), spread
 
