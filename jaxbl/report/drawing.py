@@ -28,7 +28,6 @@ from jaxbl.json_types import JsonObject
 from .panels import (
     BLACK,
     MISSING,
-    Axis,
     Band,
     Bars,
     Figure,
@@ -165,7 +164,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     foot = height + 0.1 if below else 0.0
     canvas = Canvas(figsize=(figure.width, figure.height * rows + foot), layout="none")  # pyright: ignore[reportArgumentType]
     grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*[1.0] * columns, *[0.035 * columns] * shared])
-    axes, axes_by_axis = [], dict[tuple[str, Axis], Axes]()
+    axes, axes_by_axis = [], {}
     for i, panel in enumerate(panels):
         how = {f"share{name}": axes_by_axis.get((name, axis)) for name, axis in panel.axes.items() if axis.label}
         ax = canvas.add_subplot(grid[i // columns, i % columns], **how)
@@ -358,7 +357,7 @@ _DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _dra
 
 def _legend_handles(panel: Panel) -> dict[str, Any]:
     """The legend's handle of each name in a panel that does not stand beside its line."""
-    handles: dict[str, Any] = {}
+    handles = {}
     for part in panel.parts:
         is_hidden = part.at_line if isinstance(part, Line) else isinstance(part, Map) and not np.any(part.failed)
         if is_hidden or not part.name or part.name in handles:

@@ -96,9 +96,12 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
     _, exact = condition_curves(EXACT, bound, alphas)
     # α has to exceed f⁺, whatever λ is
     x, y = [alphas[0], exact.x[0], *exact.x], [lambdas[1], lambdas[1], *exact.y]
-    parts = [Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6), exact._replace(colour="#000000", at_line=False)]
-    parts.append(usual_rule_curve(bound, alphas))
-    parts.append(mark(alpha, lambda_, "the observer's gains"))
+    parts = [
+        Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6),
+        exact._replace(colour="#000000", at_line=False),
+        usual_rule_curve(bound, alphas),
+        mark(alpha, lambda_, "the observer's gains"),
+    ]
     caption = (
         f"Gains of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) and the least λ of the exact "
         f"condition at the true f⁺ = {bound:.3g} rad/s² along the run; the usual rule's gains for this f⁺ and larger ones. "

@@ -97,26 +97,24 @@ def _backlash(summary: JsonObject) -> list[KeyFigure]:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines, unseen = [], (summary.get("backlash") or {}).get("why")
+    fit, unseen = summary["method"]["trajectory"], (summary.get("backlash") or {}).get("why")
+    lines = []
     for refusal in summary["refused"]:
-        if refusal["why"] == unseen:
-            continue
         shares = ", ".join(f"{path} {share:+.2f}" for path, share in refusal["direction"].items())
-        lines.append(f"Not identifiable: {shares}: {refusal['why']}.")
-    if summary["held"]:
-        lines.append(f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.")
-    lines += (line for _, line in _describe_residuals(summary))
-    fit = summary["method"]["trajectory"]
-    lines.append(
-        "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
-        if "backlash" in summary
-        else f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
+        lines.append(refusal["why"] != unseen and f"Not identifiable: {shares}: {refusal['why']}.")
+    how = (
+        f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
         f"{fit['starts']} starts agree."
     )
-    if not fit["converged"]:
-        lines.append("The fit stopped before it reached its tolerance.")
-    if summary["torque"]:
-        lines.append(f"Torque error of the model, rms: {_shares(summary['torque'])}.")
+    if "backlash" in summary:
+        how = "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
+    lines += [
+        summary["held"] and f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.",
+        *(line for _, line in _describe_residuals(summary)),
+        how,
+        not fit["converged"] and "The fit stopped before it reached its tolerance.",
+        summary["torque"] and f"Torque error of the model, rms: {_shares(summary['torque'])}.",
+    ]
     for side, gains in summary.get("gains", {}).items():
         error = gains["velocity_error"]
         lines.append(
@@ -127,7 +125,7 @@ def _remarks(summary: JsonObject) -> Lines:
         )
     if "holdout" in summary:
         lines += _on_holdout(summary["holdout"])
-    return [*lines, *summary["notes"]]
+    return [*filter(None, lines), *summary["notes"]]
 
 
 def _describe_residuals(summary: JsonObject) -> list[tuple[bool, str]]:
@@ -214,10 +212,9 @@ class LogSignals:
         )
         plant = dataclasses.replace(self.plant, effects=effects)
         with jax.enable_x64(True):
-            still = {side: jnp.asarray(0.0) for side in SIDES}
+            still = dict.fromkeys(SIDES, jnp.zeros(len(twist)))
             states = tuple(effect.init() for effect in effects)
-            position = {"motor": jnp.asarray(twist), "load": jnp.zeros(len(twist))}
-            torque, _ = plant.transmitted_torque(position, still, states)
+            torque, _ = plant.transmitted_torque(still | {"motor": jnp.asarray(twist)}, still, states)
         return np.asarray(torque)
 
     def torque_by(self, side: str) -> Array:

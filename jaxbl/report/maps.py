@@ -27,21 +27,7 @@ from jaxbl.sweeps.sweep import StudyResult
 from .aggregates import Column, Groups, Rows
 from .checks import MOST_PARTS, check_figures, has_words, values_of
 from .gain_plane import condition_curves
-from .panels import (
-    COLOURS,
-    Array,
-    Axis,
-    Band,
-    Figure,
-    Line,
-    Map,
-    Panel,
-    Part,
-    Scale,
-    arrange,
-    mark,
-    with_unit,
-)
+from .panels import COLOURS, Array, Axis, Band, Figure, Line, Map, Panel, Scale, arrange, mark, with_unit
 from .refined_maps import Filling
 
 
@@ -72,7 +58,7 @@ def draw(result: StudyResult) -> list[Figure]:
     specs = config.figures or default_figures(config, result.columns)
     check_figures(config, specs, result.columns)
     points = Points(config)
-    figures: list[Figure] = []
+    figures = []
     runs = sum(map(len, result.batches(["seed"]))) if specs else 0
     unfinished = "" if result.is_finished(runs) else f" The study is not finished: {runs} runs so far, white where none is."
     for i, spec in enumerate(specs):
@@ -97,12 +83,13 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     names = "finite", "converged", "f_plus", "margin_alpha"
     metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
     columns = [*config.axis_paths, "seed", *metrics]
-    random = [axis for axis in config.axes if axis.path in (figure.x, figure.y) and axis.values is None and axis.num is None]
+    drawn = [axis for axis in config.axes if axis.path in (figure.x, figure.y)]
+    random = [axis for axis in drawn if axis.values is None and axis.num is None]
     # about four points in each bin of a map
     bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))
 
     # of a refined study what lies on the coarse grid along all axes but those drawn
-    starts = {axis.path: axis.start for axis in config.axes if axis.path in (figure.x, figure.y)}
+    starts = {axis.path: axis.start for axis in drawn}
 
     def select(frame: DataFrame) -> DataFrame:
         frame = filter_rows(frame[points.on_coarse_grid(frame.assign(**starts))], resolve_where(config, figure))
@@ -139,8 +126,12 @@ def axis_label(config: Config, path: str) -> str:
 
 
 def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -> tuple[Axis, Array]:
-    """An axis of a figure that shows the cells about some values of a study's axis, and their edges."""
-    log = is_log(config, path, values) if log is None else log
+    """An axis of a figure that shows the cells about some values of a study's axis, which rise, and their edges; it is
+    logarithmic as declared, or where listed values grow geometrically."""
+    if log is None:
+        axis = next(axis for axis in config.axes if axis.path == path)
+        grows = len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0
+        log = axis.scale == "log" if axis.values is None else bool(grows)
     edges = cell_edges(values, log)
     return Axis(axis_label(config, path), path, log, (edges[0], edges[-1])), edges
 
@@ -153,8 +144,7 @@ def axis_words(config: Config, path: str) -> dict[str, str]:
 
 def unit_of(config: Config, path: str) -> str:
     """The unit of what an axis varies; none of words."""
-    parameter = numeric_paths(config).get(path)
-    return "" if parameter is None else parameter.unit
+    return getattr(numeric_paths(config).get(path), "unit", "")
 
 
 def with_value(config: Config, path: str | None, value: Any) -> str:
@@ -224,15 +214,6 @@ def cell_edges(centres: Array, log: bool) -> Array:
     return np.exp(edges) if log else edges
 
 
-def is_log(config: Config, path: str, values: Array) -> bool:
-    """True if an axis is drawn logarithmically: as declared, or listed values that grow geometrically."""
-    axis = next(a for a in config.axes if a.path == path)
-    if axis.values is None:
-        return axis.scale == "log"
-    values = np.unique(values)
-    return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
-
-
 def _split(table: Any, path: str | None) -> list[tuple[Any, Any]]:
     """The value of each panel or line, and its part of a table or of rows; None and all where there is one alone."""
     if path is None:
@@ -287,11 +268,11 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         grid, failed = (plane[name].unstack() for name in plane)
         centres = (index.to_numpy(float) for index in (grid.columns, grid.index))
         (x, x_edges), (y, y_edges) = (axis_of(config, *axis) for axis in zip(axes, centres, strict=True))
-        parts: list[Part] = [Map(x_edges, y_edges, grid.to_numpy(), scale, failed.to_numpy() > 0.5, failure)]
+        parts = [Map(x_edges, y_edges, grid.to_numpy(), scale, failed.to_numpy() > 0.5, failure)]
         under = [flat_remark(part["shown"].to_numpy(float))]
         if errors and (best := best_gains(errors[value])):
             place = errors[value].index[best.index]
-            parts.append(mark(*place[::-1], "best", size=13.0))
+            parts += [mark(*place[::-1], "best", size=13.0)]
             under.append(f"best ★ {part['value'][place]:.2g} {find_metric(spec.value).unit}".rstrip())
         if bounds is not None:
             bound, alpha_is_x = bounds[i], spec.x.endswith(".alpha")
@@ -376,7 +357,7 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
     scale = colour_scale(spread.to_numpy(), value_label(spec.value), spec.scale)
     middle = "mean" if is_boolean(spec.value) else "median"
     for facet, part in _split(table.reset_index(), spec.facet):
-        parts = list[Part]()
+        parts = []
         for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
             x, name = line[spec.x], with_value(config, spec.series, value)
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
@@ -392,7 +373,7 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
     """Points of lines that theory gives a slope for, with the lines fitted; a line without a law has its name."""
     panels = []
     for facet in dict.fromkeys(law.where.get(spec.facet) for law in laws):
-        parts, members = list[Part](), [law for law in laws if law.where.get(spec.facet) == facet]
+        parts, members = [], [law for law in laws if law.where.get(spec.facet) == facet]
         for law, colour in zip(members, cycle(COLOURS), strict=False):
             lead = "".join(f"{_text(value)}: " for value in law.series.values())
             slope, x, y = "no law", [], []

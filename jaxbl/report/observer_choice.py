@@ -21,21 +21,7 @@ from jaxbl.lines import Lines
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .maps import axis_label, with_value
-from .panels import (
-    SIDE_COLOURS,
-    Axis,
-    Figure,
-    Line,
-    Map,
-    Panel,
-    Part,
-    Scale,
-    Span,
-    arrange,
-    intervals,
-    name_rows,
-    tick_text,
-)
+from .panels import SIDE_COLOURS, Axis, Figure, Line, Map, Panel, Scale, Span, arrange, intervals, name_rows, tick_text
 from .tune import error_label, for_title, write_gains
 
 
@@ -58,7 +44,7 @@ def _ratios(summary: JsonObject) -> Figure:
         ratio, low, high = compared.to_numpy()
         texts = ["best" if i == 0 else _ratio(kinds[kind]) for i, kind in enumerate(compared)]
         texts += ["diverged, or too slow"] * len(lost)
-        parts: list[Part] = [
+        parts = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
             *intervals(range(len(high)), low, ratio, high, colour=SIDE_COLOURS[side]),
             Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
@@ -89,7 +75,7 @@ def _ratio(result: JsonObject) -> str:
 def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, list[Any]]:
     """Values of the axes that have several, in their order; of axes that advance together, those of the side's own, or of
     the first."""
-    together: dict[str, list[str]] = {}
+    together = {}
     assert config.tune is not None
     for axis in config.tune.axes:
         together.setdefault(axis.zip or axis.path, []).append(axis.path)
@@ -100,7 +86,7 @@ def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, 
 
 def short_names(kinds: Sequence[str]) -> dict[str, str]:
     """Few letters for each kind: the initials of its words, with a number in full, and a stroke where two are the same."""
-    names: dict[str, str] = {}
+    names = {}
     for kind in kinds:
         name = "".join(word if word.isdigit() else word[0].upper() for word in kind.split("_"))
         while name in names.values():
@@ -201,7 +187,7 @@ def observer_toml(summary: JsonObject) -> str | None:
     ]
     gains = {side: dict(result["gains"]) for side, result in sides.items()}
     constants = {side: gains[side].pop(TIME_CONSTANT) for side in sides if TIME_CONSTANT in gains[side]}
-    data: JsonObject = {"observer": {"kind": kind, **gains}}
+    data = {"observer": {"kind": kind, **gains}}
     if constants:
         data["equivalent_control"] = {"time_constant": constants.get("motor")}
         if len(constants) > 1:

@@ -206,9 +206,8 @@ def join(axis: Any, parts: Iterable[slice], *signals: Any) -> list[Array]:
     return columns
 
 
-def draw_signals(time: Any, segments: Iterable[slice], signals: Iterable[tuple[Any, str, str, str]]) -> list[Panel]:
+def draw_signals(time: Any, segments: Iterable[slice], signals: Sequence[tuple[Any, str, str, str]]) -> list[Panel]:
     """A panel over time for each signal: its values, label, unit and colour; lines break between segments."""
-    signals = list(signals)
     time, *joined = join(time, segments, *(values for values, *_ in signals))
     return [
         Panel(TIME, Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])

@@ -61,7 +61,7 @@ def _log(result: Any) -> Subject:
 
 
 # by the type of the result, which is the argument of its module's `draw`
-_KINDS: dict[type, _Kind] = {
+_KINDS = {
     next(iter(kind.report.draw.__annotations__.values())): kind
     for kind in (
         _Kind(simulate, "summary.json"),

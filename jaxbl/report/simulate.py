@@ -12,17 +12,7 @@ from jaxbl.sweeps.trial import Trial
 
 from .error_plane import error_plane
 from .gain_plane import conditions_line, draw_gain_plane
-from .panels import (
-    SIDE_COLOURS,
-    SIDES,
-    TIME,
-    VERMILION,
-    ZERO,
-    Axis,
-    Figure,
-    Line,
-    Panel,
-)
+from .panels import SIDE_COLOURS, SIDES, TIME, VERMILION, ZERO, Axis, Figure, Line, Panel
 
 
 def write(trial: Trial, folder: Path) -> str:

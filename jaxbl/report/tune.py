@@ -18,16 +18,7 @@ from .certificate import certificate_lines, certificate_tables, is_refuted, writ
 from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usual_rule_curve
 from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
-from .panels import (
-    MARKERS,
-    Figure,
-    Map,
-    Panel,
-    Part,
-    literal,
-    mark,
-    with_unit,
-)
+from .panels import MARKERS, Figure, Map, Panel, literal, mark, with_unit
 
 
 def draw(tuning: Tuning) -> list[Figure]:
@@ -51,12 +42,12 @@ def _map(tuning: Tuning, side: str) -> Figure:
     x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
     alphas, lambdas = ((edges[0], edges[-1]) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
-    parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
+    parts = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
     # on the study's own excitation
     compared = [row for row in summary["named"] if row["side"] == side and row["name"] != "tuned"]
     for row, marker in zip(compared, cycle(MARKERS), strict=False):
-        parts.append(mark(row["alpha"], row["lambda"], literal(row["name"]), marker, 8.0))
-    parts.append(mark(gains["alpha"], gains["lambda"], "tuned"))
+        parts += [mark(row["alpha"], row["lambda"], literal(row["name"]), marker, 8.0)]
+    parts += [mark(gains["alpha"], gains["lambda"], "tuned")]
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     if flat := flat_remark(values):
         title = f"{title}\n{flat}"
@@ -182,10 +173,12 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
 
 def gains_toml(summary: JsonObject) -> str:
     """The chosen gains as TOML that a study can `include`; comments say what they were chosen for."""
-    margins = summary["margins"]
+    margins, (first, last) = summary["margins"], summary["seeds"]
+    seeds, drives = last - first + 1, len(summary["scenarios"])
     lines = [
         f"# Gains chosen by 'jaxbl tune'{for_title(summary)}",
-        f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.",
+        f"# Objective: {summary['objective_metric']}; {seeds} noise seed{'s' * (seeds > 1)} and {drives} "
+        f"drive{'s' * (drives > 1)}.",
         f"# Margins asked for: alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition "
         f"{margins['exact']:g}.",
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.',
@@ -209,12 +202,6 @@ def for_title(summary: JsonObject) -> str:
     """Say what gains were chosen for, in one line."""
     title = " ".join(summary["title"].split())
     return f" for: {title}" if title else ""
-
-
-def _runs_behind(summary: JsonObject) -> str:
-    first, last = summary["seeds"]
-    seeds, drives = last - first + 1, len(summary["scenarios"])
-    return f"{seeds} noise seed{'s' * (seeds > 1)} and {drives} drive{'s' * (drives > 1)}"
 
 
 def _where(summary: JsonObject) -> str:
