@@ -147,8 +147,10 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
             f"By the log the model lacks {names}, but it predicts the held-out data worse with {_them(summary)}.",
         )
     quantity = "missing torque" if "backlash" not in summary else "motor's squared prediction error beyond noise"
+    share = summary["explained_share"] or 0.0
+    text = f"{100.0 * share:.{0 if share < 0.99 else 1}f} %" if share <= 0.999 else "more than 99.9 %"
     return "doubtful", (
-        f"The model lacks {names}, but that is not all: on held-out data {_share(summary['explained_share'])} of the "
+        f"The model lacks {names}, but that is not all: on held-out data {'none' if share < 0.005 else text} of the "
         f"{quantity} is explained."
     )
 
@@ -201,12 +203,6 @@ def _table_lines(summary: JsonObject) -> Lines:
     ]
     than = "" if added["holdout_z"] > 0.0 else ", which predict held-out data no better"
     return [f"Not named, but in model.toml as tables: {_join_words(torques)}{than}."]
-
-
-def _share(value: float | None) -> str:
-    if not value or value < 0.005:
-        return "none"
-    return "more than 99.9 %" if value > 0.999 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
 
 
 def _names(summary: JsonObject) -> str:

@@ -4,7 +4,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import pandas as pd
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
-from jaxbl.lines import Lines, percent
+from jaxbl.lines import percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
 from jaxbl.sweeps.points import Points
@@ -46,18 +45,31 @@ def describe(result: StudyResult) -> Result:
 def answer_sweep(result: StudyResult) -> Result:
     """Say where the observers work, and which gains are best, with tables of axes that matter."""
     config, survey, remarks = result.config, _Survey(result), []
-    finished = result.is_finished(survey.runs)
+    finished, figures = result.is_finished(survey.runs), []
     if not finished:
         remarks.append(f"The study is not finished: it has {result.runs} runs so far. Go on with 'jaxbl sweep'.")
     if survey.diverged:
         remarks.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
-    remarks += (line for side, (best, _) in survey.best.items() for line in _best_lines(side, best))
+    for side, (best, runs) in survey.best.items():
+        if best is None:
+            remarks.append(f"{side}: no gains converged in all runs with α above f⁺.")
+            continue
+        remarks += [
+            f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
+            for gain, way in best.ends.items()
+        ]
+        row = runs.reset_index().iloc[best.index]
+        place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
+        as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
+        figures += [
+            KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})"),
+            KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}"),
+        ]
     works = survey.diverged < survey.runs and all(survey.converged.values())
     works = works and all(best is not None for best, _ in survey.best.values())
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
     verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
-    figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
     tables = [
         ResultTable(
@@ -68,16 +80,6 @@ def answer_sweep(result: StudyResult) -> Result:
         for side, ranked in survey.importance.items()
     ]
     return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes, tables)
-
-
-def _best_figures(side: str, best: BestGains | None, runs: pd.DataFrame) -> Iterator[KeyFigure]:
-    """The best gains of a side with their error, and how far they may change."""
-    if best is not None:
-        row = runs.reset_index().iloc[best.index]
-        place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
-        yield KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})")
-        as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
-        yield KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}")
 
 
 def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
@@ -147,16 +149,6 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         for side in survey.sides
     ]
     return f"{count}: {'; '.join(shares)}." if shares else f"{count}."
-
-
-def _best_lines(side: str, best: BestGains | None) -> Lines:
-    """Say what is wrong with the best gains of a side."""
-    if best is None:
-        return [f"{side}: no gains converged in all runs with α above f⁺."]
-    return [
-        f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
-        for gain, way in best.ends.items()
-    ]
 
 
 def _explain_ends(law: Law) -> str:

@@ -71,11 +71,6 @@ def _missing(names: list[str]) -> str:
 _GAINS = ("lambda", "λ", "√rad/s"), ("alpha", "α", "rad/s²")
 
 
-def _size(change: float) -> str:
-    """A relative change in few characters."""
-    return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{'+' * (change > 0.0)}{percent(change)}"
-
-
 def _way(symbol: str, unit: str, way: JsonObject) -> str:
     """Say what limits a gain towards one side, as part of a sentence."""
     if way["limit"] == "range":
@@ -84,11 +79,13 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     if way["at"] is None:
         return missed
     place = f"{symbol} = {way['at']:.3g} {unit}"
-    if way["change"] is None:
+    change = way["change"]
+    if change is None:
         return f"runs diverge (at {place})"
+    size = f"× {1.0 + change:.2g}" if change >= 1.0 else f"{'+' * (change > 0.0)}{percent(change)}"
     cause = {"chatter": ", as its chatter grows", "slow": ", as its slow part grows", None: ""}[way["by"]]
     joint = "but" if way["limit"] == "constraint" else "and"
-    return f"error {_size(way['change'])} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
+    return f"error {size} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
 
 
 def write(tuning: Tuning, folder: Path) -> str:
@@ -127,11 +124,14 @@ def describe(tuning: Tuning) -> Result:
     if is_refuted(summary):
         verdict, headline = "failed", "The search found an error above what was proven."
         remarks = [*certified, *doubts, *_reasons(summary)]
-    details = [line for line in summary["remarks"] if line not in doubts]
+    details, holdout = [line for line in summary["remarks"] if line not in doubts], summary["holdout"]
+    where = f"On the held-out excitation ({holdout['excitation']['kind']})"
+    if holdout["same_excitation"]:
+        where = "On the study's excitation with other noise"
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
-        _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
+        _comparison_table(f"{where}, worst and median of all runs", holdout["rows"]),
     ]
     title = tuning.config.title or "Gains"
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
@@ -202,13 +202,6 @@ def for_title(summary: JsonObject) -> str:
     """Say what gains were chosen for, in one line."""
     title = " ".join(summary["title"].split())
     return f" for: {title}" if title else ""
-
-
-def _where(summary: JsonObject) -> str:
-    """Which runs were held out."""
-    runs = summary["holdout"]
-    other = f"on the held-out excitation ({runs['excitation']['kind']})"
-    return "on the study's excitation with other noise" if runs["same_excitation"] else other
 
 
 def _reasons(summary: JsonObject) -> Lines:
