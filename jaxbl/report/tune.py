@@ -71,6 +71,11 @@ def _missing(names: list[str]) -> str:
 _GAINS = ("lambda", "λ", "√rad/s"), ("alpha", "α", "rad/s²")
 
 
+def _size(change: float) -> str:
+    """A relative change in few characters."""
+    return f"× {1.0 + change:.2g}" if change >= 1.0 else f"{'+' * (change > 0.0)}{percent(change)}"
+
+
 def _way(symbol: str, unit: str, way: JsonObject) -> str:
     """Say what limits a gain towards one side, as part of a sentence."""
     if way["limit"] == "range":
@@ -79,13 +84,11 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     if way["at"] is None:
         return missed
     place = f"{symbol} = {way['at']:.3g} {unit}"
-    change = way["change"]
-    if change is None:
+    if way["change"] is None:
         return f"runs diverge (at {place})"
-    size = f"× {1.0 + change:.2g}" if change >= 1.0 else f"{'+' * (change > 0.0)}{percent(change)}"
     cause = {"chatter": ", as its chatter grows", "slow": ", as its slow part grows", None: ""}[way["by"]]
     joint = "but" if way["limit"] == "constraint" else "and"
-    return f"error {size} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
+    return f"error {_size(way['change'])} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
 
 
 def write(tuning: Tuning, folder: Path) -> str:
