@@ -212,7 +212,7 @@ class LogSignals:
         )
         plant = dataclasses.replace(self.plant, effects=effects)
         with jax.enable_x64(True):
-            still = dict.fromkeys(SIDES, jnp.zeros(len(twist)))
+            still = {side: jnp.zeros(len(twist)) for side in SIDES}
             states = tuple(effect.init() for effect in effects)
             torque, _ = plant.transmitted_torque(still | {"motor": jnp.asarray(twist)}, still, states)
         return np.asarray(torque)

@@ -25,7 +25,7 @@ class Filling:
     def __init__(self, points: Points, frame: DataFrame, x: str, y: str):
         assert points.refinement is not None
         # values of each axis, and how many of them a coarse cell has
-        self._axes: dict[str, tuple[Array, int]] = {}
+        self._axes = {}
         for path in (y, x):
             refined = path in points.refinement.paths
             values = points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float))

@@ -7,11 +7,9 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import pandas as pd
-
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
-from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
+from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.lines import percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
@@ -108,26 +106,24 @@ class _Survey:
         paths = config.axis_paths
         names = "converged", "velocity_rmse", "margin_alpha"
         metrics = [column for column in result.columns if column.rpartition(".")[2] in names]
-        self.sides = [side for side in config.sides if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(config)
         self.runs = self.even = self.diverged = 0
-        self.converged = dict.fromkeys(self.sides, 0)
-        self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
+        self.converged = {side: 0 for side in config.sides if f"{side}.converged" in metrics}
+        self.best, self.importance = {}, {}
         for frame in result.batches([*paths, "seed", "finite", *metrics]):
             even = frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
-            self.diverged += int((~frame["finite"].astype(bool)).sum())
-            for side in self.sides:
-                self.converged[side] += int(even[f"{side}.converged"].sum())
-        self.importance: dict[str, list[AxisImportance]] = {}
+            self.diverged += (~frame["finite"].astype(bool)).sum()
+            for side in self.converged:
+                self.converged[side] += even[f"{side}.converged"].sum()
         varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
         for side in config.sides:
             error, gains = f"{side}.velocity_rmse", [path for path in varied if path.startswith(f"observer.{side}.")]
             if error in metrics and (ranked := rank_axes(result, error)):
                 self.importance[side] = ranked
-            if error in metrics and side in self.sides and gains:
+            if error in metrics and side in self.converged and gains:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
                 groups = Groups(Rows(result, columns), gains, paths)
                 runs = worst_runs(groups, error)
@@ -136,19 +132,19 @@ class _Survey:
 
 def _headline(result: StudyResult, survey: _Survey) -> str:
     """Say in how many runs the observers converge."""
-    count, among = f"{survey.runs} runs", ""
+    runs, among = f"{survey.runs} runs", ""
     if result.config.sweep.refine is not None:
         points = len(Points(result.config))
         simulated = survey.runs // result.config.sweep.seeds
-        count = f"{count} at {simulated} of {points} grid points ({percent(simulated / points)})"
+        runs = f"{runs} at {simulated} of {points} grid points ({percent(simulated / points)})"
         among = " on the coarse grid"
     even = survey.even or math.nan
     works = {side: ", with the best gains in all" for side, (best, _) in survey.best.items() if best is not None}
     shares = [
-        f"the {side} observer converges in {100 * survey.converged[side] / even:.1f} %{among}{works.get(side, '')}"
-        for side in survey.sides
+        f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
+        for side, count in survey.converged.items()
     ]
-    return f"{count}: {'; '.join(shares)}." if shares else f"{count}."
+    return f"{runs}: {'; '.join(shares)}." if shares else f"{runs}."
 
 
 def _explain_ends(law: Law) -> str:

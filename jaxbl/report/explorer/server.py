@@ -78,8 +78,7 @@ class ExplorerServer(ThreadingHTTPServer):
         self.token = secrets.token_urlsafe(24)
         self._lock, self._stale = threading.Lock(), True
         # folders of its versions, and which of these a browser has loaded
-        self._pages: dict[str, Path] = {}
-        self._loaded: set[str] = set()
+        self._pages, self._loaded = {}, set()
         super().__init__(("127.0.0.1", port), _Handler)
         self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
         self.url = f"http://127.0.0.1:{self.server_port}/{self.token}/"
