@@ -70,10 +70,11 @@ class Groups:
         self.varied, self.columns = set[str](), set[str]()
         for frame in rows:
             self.columns |= {*frame}
-            distinct.append(frame[self._keys].drop_duplicates())
-            # seldom, as it goes through all that differ
-            if sum(map(len, distinct[1:])) > len(distinct[0]) + 10_000:
-                distinct = [pd.concat(distinct).drop_duplicates()]
+            if self._keys:
+                distinct.append(frame[self._keys].drop_duplicates())
+                # seldom, as it goes through all that differ
+                if sum(map(len, distinct[1:])) > len(distinct[0]) + 10_000:
+                    distinct = [pd.concat(distinct).drop_duplicates()]
             for name in further if len(frame) else ():
                 column = frame[name].to_numpy()
                 if (column != first.setdefault(name, column[0])).any():

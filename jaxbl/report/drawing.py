@@ -2,11 +2,9 @@
 
 import base64
 import contextlib
-import itertools
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -157,7 +155,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     scales = _scales(panels)
     shared = len(scales) == 1
     # one legend for all panels where one of them has all names, for maps, and where a second scale stands above
-    below = dict(itertools.chain(*(handles.items() for handles in names)))
+    below = {name: handle for handles in names for name, handle in handles.items()}
     if not scales and len(below) > max(map(len, names)) and not any(panel.x.ratio for panel in panels):
         below = {}
     fit, height = _size_legend(below, figure.width)
@@ -193,8 +191,8 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
 
 def _scales(panels: Sequence[Panel]) -> list[Scale]:
     """Scales of maps that have a colour bar."""
-    parts = itertools.chain(*(panel.parts for panel in panels))
-    return list(dict.fromkeys(part.scale for part in parts if isinstance(part, Map) and part.scale.label))
+    maps = (part for panel in panels for part in panel.parts if isinstance(part, Map) and part.scale.label)
+    return list(dict.fromkeys(part.scale for part in maps))
 
 
 def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
@@ -206,9 +204,11 @@ def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
 def _legend_above(ax: Axes, handles: dict[str, Any], width: float) -> float:
     """Draw a legend above the axes, where it hides no line. Returns its height, inches."""
     fit, height = _size_legend(handles, width - 0.6)
-    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
     if handles:
-        ax.legend(handles.values(), handles, ncols=fit, **place)
+        ax.legend(
+            handles.values(), handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=fit, borderaxespad=0.1,
+            columnspacing=1.2,
+        )  # fmt: skip
     return height
 
 
@@ -262,7 +262,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
 
 def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
     """Draw the second scale of an axis, on the top or on the right."""
-    scales = partial(np.multiply, 1.0 / unit), partial(np.multiply, unit)
+    scales = lambda values: values / unit, lambda values: values * unit
     second = getattr(ax, f"secondary_{name}axis")({"x": "top", "y": "right"}[name], functions=scales)
     axis = getattr(second, f"{name}axis")
     axis.set_label_text(label)
@@ -271,23 +271,24 @@ def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
 
 
 def _line_look(line: Line) -> dict[str, Any]:
-    look = {"ls": line.dashes if line.width else "", "lw": line.width, "color": line.colour, "marker": line.marker}
-    edge = line.colour if line.marker in "x|+" or line.fill else line.fill or "none"
-    return look | {"ms": line.size, "mfc": line.fill or line.colour, "mec": edge, "mew": 1.1 if line.fill else 1.0}
+    return {
+        "ls": line.dashes if line.width else "", "lw": line.width, "color": line.colour, "marker": line.marker,
+        "ms": line.size, "mfc": line.fill or line.colour, "mew": 1.1 if line.fill else 1.0,
+        "mec": line.colour if line.marker in "x|+" or line.fill else "none",
+    }  # fmt: skip
 
 
 def _draw_line(ax: Axes, line: Line, layer: float) -> None:
     if line.held:
         x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
         line = line._replace(x=x, y=y)
-    look: Any = {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
-    (artist,) = ax.plot(line.x, line.y, **_line_look(line), **look)
+    look = _line_look(line) | {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
+    (artist,) = ax.plot(line.x, line.y, **look)
     # one by one, markers would be larger than an image of them
     artist.set_rasterized(bool(line.marker) and len(line.x) > 800)
-    centred: Any = {"ha": "center", "va": "center"}
-    beside: Any = {"va": "center", "xytext": (6, 0), "textcoords": "offset points"}
+    place: Any = {"xytext": (6, 0), "textcoords": "offset points"} if line.marker else {"ha": "center"}
     for x, y, text in zip(line.x, line.y, line.texts):  # noqa: B905
-        ax.annotate(text, (x, y), fontsize=8, zorder=6, **(beside if line.marker else centred))
+        ax.annotate(text, (x, y), va="center", fontsize=8, zorder=6, **place)
 
 
 def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
