@@ -58,15 +58,16 @@ def draw(result: ElementIdentification) -> list[Figure]:
     trace, record, numbers = result.trace, result.task.record, result.element.numbers
     unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))
     time, x, u, fitted = (trace[name].to_numpy() for name in ("t", "displacement", "u", "torque"))
-    parts, gap = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)], []
+    parts = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)]
     if {"half_gap", "centre"} <= numbers.keys():
         middle, half = numbers["centre"].value, numbers["half_gap"].value
-        gap = [Span(middle - half, middle + half, "gap", ORANGE)]
+        parts += [Span(middle - half, middle + half, "gap", ORANGE)]
     axes = Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})")
-    loop = Panel(*axes, [*parts, *gap])
     signals = (u, "torque", torque_unit, BLUE), (u - fitted, "not explained", torque_unit, BLUE)
     panels = draw_signals(time, record.segments, signals)
     return [
-        Figure("loop", [loop], "Torque over displacement: as measured, and of the transmission that was found."),
+        Figure(
+            "loop", [Panel(*axes, parts)], "Torque over displacement: as measured, and of the transmission that was found."
+        ),
         Figure("residual", panels, "The torque over time, and what of it is not explained.", height=1.7),
     ]

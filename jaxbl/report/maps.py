@@ -6,7 +6,7 @@
 
 import re
 from collections.abc import Iterable
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import cycle
 from operator import itemgetter
 from typing import Any
@@ -287,7 +287,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
 def _map_table(groups: Groups, value: str) -> DataFrame:
     """The places of a map: `value`, whether it is none that means something (`failed`: too few of its runs converged, or
     one diverged), and the shares of runs that are `finite` and converged, of the columns that there are."""
-    converged, column = f"{value.partition('.')[0]}.converged", _drawn_column(value)
+    converged, column = f"{value.partition('.')[0]}.converged", partial(drawn_values, value=value)
     table = groups.means({name: itemgetter(name) for name in ("finite", converged) if name in groups.columns})
     # one number for each group: the median over what else varies, or the share that is true
     middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.spread(column)["median"]
@@ -315,14 +315,10 @@ def drawn_values(part: DataFrame, value: str) -> Series:
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
-def _drawn_column(value: str) -> Column:
-    return lambda frame: drawn_values(frame, value)
-
-
 def worst_runs(groups: Groups, value: str) -> DataFrame:
     """The worst run of each group: its `error`, the least `margin_alpha` of observers that have one, the share that
     `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
-    side, column = value.partition(".")[0], _drawn_column(value)
+    side, column = value.partition(".")[0], partial(drawn_values, value=value)
     margin = f"{side}.margin_alpha"
     columns: dict[str, Column] = {"mean": column, "square": lambda frame: column(frame) ** 2}
     means = groups.means(columns | {"converged": itemgetter(f"{side}.converged")})
@@ -350,7 +346,7 @@ def best_gains(runs: DataFrame) -> BestGains | None:
 def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], str]:
     keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
     groups = Groups(rows, keys, config.axis_paths)
-    column = _drawn_column(spec.value)
+    column = partial(drawn_values, value=spec.value)
     spread = groups.spread(column)
     table = groups.means({"mean": column}).join(spread)
     band, drawn = "", []

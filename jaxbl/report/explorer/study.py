@@ -178,12 +178,11 @@ def simulated(config: Config, asked: Any) -> JsonObject:
     planes = {}
     for side, judged in trial.summary["conditions"].items():
         path = error_path(trial.trace, side, judged)
-        e, slope = path.majorant
         planes[side] = {
             "error": pack_numbers(drawable(path.error)),
             "slope": pack_numbers(drawable(path.slope)),
             "reach": path.reach,
-            "majorant": [pack_numbers(e), pack_numbers(slope)] if len(e) else None,
+            "majorant": [*map(pack_numbers, path.majorant)] if len(path.majorant[0]) else None,
         }
     return {
         "every": step,
