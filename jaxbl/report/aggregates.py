@@ -11,11 +11,11 @@ import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from tempfile import TemporaryFile
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from pandas import DataFrame, Series
+from pandas import DataFrame
 
 from jaxbl.sweeps.sweep import StudyResult
 
@@ -35,22 +35,15 @@ class Rows:
         result: the study.
         columns: names.
         changed: applied to each part.
-        needs: columns that this looks at.
     """
 
     result: StudyResult
     columns: Sequence[str]
     changed: Callable[[DataFrame], DataFrame] = lambda frame: frame
-    needs: Sequence[str] = ()
 
     def __iter__(self) -> Iterator[DataFrame]:
-        return self.some(self.columns)
-
-    def some(self, columns: Iterable[str]) -> Iterator[DataFrame]:
-        """Some of the columns, or more."""
-        if self.result.runs * len(self.columns) <= _MOST_KEPT:
-            return iter([self.frame])
-        return map(self.changed, self.result.batches([*columns, *self.needs]))
+        few = self.result.runs * len(self.columns) <= _MOST_KEPT
+        return iter([self.frame]) if few else map(self.changed, self.result.batches(self.columns))
 
     @functools.cached_property
     def frame(self) -> DataFrame:
@@ -58,44 +51,8 @@ class Rows:
         return pd.concat(map(self.changed, self.result.batches(self.columns)), ignore_index=True)
 
 
-class Distinct:
-    """Rows that differ from one another, of frames that come one after the other."""
-
-    def __init__(self):
-        self._frames: list[DataFrame] = []
-        self._known = self._new = 0
-
-    def add(self, frame: DataFrame) -> None:
-        """Note the rows of another frame."""
-        self._frames.append(frame.drop_duplicates())
-        self._new += len(self._frames[-1])
-        if self._new > self._known + 10_000:
-            self.frame()
-
-    def frame(self) -> DataFrame:
-        """All that differ, in the order of their first appearance."""
-        together = pd.concat(self._frames, ignore_index=True).drop_duplicates(ignore_index=True)
-        self._frames, self._known, self._new = [together], len(together), 0
-        return together
-
-
-class Spread(NamedTuple):
-    """Numbers of each group `(groups,)`, NaN left out."""
-
-    least: Array
-    median: Array
-    largest: Array
-
-
-def _read_columns(rows: Iterable[DataFrame], columns: Iterable[str]) -> Iterable[DataFrame]:
-    return rows.some(columns) if isinstance(rows, Rows) else rows
-
-
-class Column(NamedTuple):
-    """Numbers of each row, from some columns of it."""
-
-    needs: Sequence[str]
-    of: Callable[[DataFrame], Any]
+Column = Callable[[DataFrame], Any]
+"""Gives a number of each row of a frame."""
 
 
 class Groups:
@@ -104,23 +61,27 @@ class Groups:
     Attributes:
         index: values of the columns, a level each.
         varied: columns of the rows that have more than one value.
+        columns: all columns of the rows.
     """
 
     def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], further: Sequence[str] = ()):
         self._rows, self._keys = rows, list(keys)
-        distinct, first = Distinct(), {}
-        self.varied: set[str] = set()
-        for frame in _read_columns(rows, [*self._keys, *further]):
+        distinct, first = list[DataFrame](), {}
+        self.varied, self.columns = set[str](), set[str]()
+        for frame in rows:
+            self.columns |= {*frame}
             if self._keys:
-                distinct.add(frame[self._keys])
+                distinct.append(frame[self._keys].drop_duplicates())
+                # seldom, as it goes through all that differ
+                if sum(map(len, distinct[1:])) > len(distinct[0]) + 10_000:
+                    distinct = [pd.concat(distinct).drop_duplicates()]
             for name in further if len(frame) else ():
                 column = frame[name].to_numpy()
                 if (column != first.setdefault(name, column[0])).any():
                     self.varied.add(name)
-        if not self._keys:
-            self.index: pd.Index = pd.RangeIndex(1)
-            return
-        self.index = distinct.frame().sort_values(self._keys).set_index(self._keys).index
+        self.index: pd.Index = pd.RangeIndex(1)
+        if self._keys:
+            self.index = pd.concat(distinct).drop_duplicates().sort_values(self._keys).set_index(self._keys).index
 
     def __len__(self) -> int:
         return len(self.index)
@@ -131,64 +92,50 @@ class Groups:
             return np.zeros(len(frame), np.int64)
         return self.index.get_indexer(frame.set_index(self._keys).index)
 
-    def _read(self, columns: Sequence[Column]) -> Iterator[tuple[Array, list[Array]]]:
+    def _read(self, *columns: Column) -> Iterator[tuple[Array, list[Array]]]:
         """Groups of the rows, and numbers by column, part by part."""
-        for frame in _read_columns(self._rows, [*self._keys, *(name for column in columns for name in column.needs)]):
-            yield self.of(frame), [np.asarray(column.of(frame), float) for column in columns]
+        for frame in self._rows:
+            yield self.of(frame), [np.asarray(column(frame), float) for column in columns]
+
+    def _numbers(self, column: Column) -> Iterator[tuple[Array, Array]]:
+        """Groups and numbers of the rows that have one, part by part."""
+        for groups, (values,) in self._read(column):
+            there = ~np.isnan(values)
+            yield groups[there], values[there]
 
     def means(self, columns: dict[str, Column]) -> DataFrame:
         """Means of numbers by group, NaN left out, and the number of rows in `rows`."""
-        rows, counts = np.zeros(len(self), np.int64), np.zeros((len(columns), len(self)), np.int64)
-        sums = np.zeros(counts.shape)
-        for groups, numbers in self._read([*columns.values()]):
+        rows, (sums, counts) = np.zeros(len(self), np.int64), np.zeros((2, len(columns), len(self)))
+        for groups, numbers in self._read(*columns.values()):
             np.add.at(rows, groups, 1)
-            for i, values in enumerate(numbers):
+            for total, count, values in zip(sums, counts, numbers, strict=True):
                 there = ~np.isnan(values)
-                np.add.at(sums[i], groups[there], values[there])
-                np.add.at(counts[i], groups[there], 1)
+                np.add.at(total, groups[there], values[there])
+                np.add.at(count, groups[there], 1.0)
         with np.errstate(invalid="ignore"):
             means = dict(zip(columns, sums / counts, strict=True))
         return DataFrame({"rows": rows, **means}, index=self.index)
 
-    def spread(self, column: Column) -> Spread:
-        """The spread of a column's numbers in each group."""
-        return spread(lambda: ((groups, values) for groups, (values,) in self._read([column])), len(self))
-
-    def medians(self, column: Column) -> Series:
-        """The median of a column in each group."""
-        return Series(self.spread(column).median, self.index)
-
-
-Stream = Callable[[], Iterable[tuple[Array, Array]]]
-"""Gives groups and numbers of rows, part by part, the same each time."""
-
-
-def spread(stream: Stream, groups: int) -> Spread:
-    """The spread of numbers in groups 0 ... groups - 1; NaN where a group has none."""
-    count = np.zeros(groups, np.int64)
-    for of, _ in _numbers(stream):
-        count += np.bincount(of, minlength=groups)
-    ends, total, last = np.cumsum(count), int(count.sum()), np.maximum(count - 1, 0)
-    first = ends - count
-    with TemporaryFile() as file:
-        # values of a group side by side, and one more for groups without any
-        size = total + 1
-        grouped = np.memmap(file, float, "w+", shape=size) if total > MOST_VALUES else np.empty(size)
-        grouped[-1], free = np.nan, first.copy()
-        for of, values in _numbers(stream):
-            order = np.argsort(of, kind="stable")
-            of = of[order]
-            grouped[free[of] + np.arange(len(of)) - np.searchsorted(of, of)] = values[order]
-            free += np.bincount(of, minlength=groups)
-        for start, end in zip(first, ends, strict=True):
-            grouped[start:end].sort()
-        # the median lies between two ranks; a group without numbers has the one behind all others
-        ranks = (np.where(count == 0, total, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
-        least, below, above, largest = (grouped[rank] for rank in ranks)
-    return Spread(least, 0.5 * (below + above), largest)
-
-
-def _numbers(stream: Stream) -> Iterator[tuple[Array, Array]]:
-    for of, values in stream():
-        there = ~np.isnan(values)
-        yield of[there], values[there]
+    def spread(self, column: Column) -> DataFrame:
+        """The `least`, `median` and `largest` of a column's numbers by group, NaN left out; NaN where a group has none."""
+        count = np.zeros(len(self), np.int64)
+        for groups, _ in self._numbers(column):
+            count += np.bincount(groups, minlength=len(self))
+        ends, total, last = np.cumsum(count), count.sum(), np.maximum(count - 1, 0)
+        first = ends - count
+        with TemporaryFile() as file:
+            # values of a group side by side, and one more for groups without any
+            size = total + 1
+            grouped = np.memmap(file, float, "w+", shape=size) if total > MOST_VALUES else np.empty(size)
+            grouped[-1], free = np.nan, first.copy()
+            for groups, values in self._numbers(column):
+                order = np.argsort(groups, kind="stable")
+                groups = groups[order]
+                grouped[free[groups] + np.arange(len(groups)) - np.searchsorted(groups, groups)] = values[order]
+                free += np.bincount(groups, minlength=len(self))
+            for start, end in zip(first, ends, strict=True):
+                grouped[start:end].sort()
+            # the median lies between two ranks; a group without numbers has the one behind all others
+            ranks = (np.where(count == 0, total, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
+            least, below, above, largest = (grouped[rank] for rank in ranks)
+        return DataFrame({"least": least, "median": 0.5 * (below + above), "largest": largest}, self.index)

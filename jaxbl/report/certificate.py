@@ -52,15 +52,11 @@ def _above(value: float, sign: float = 1.0) -> float:
     return float(f"{sign * math.ceil(sign * value / unit - 1e-9) * unit:.4g}")
 
 
-def _below(value: float) -> float:
-    """Rounded down, for what is assumed."""
-    return _above(value, -1.0)
-
-
 def _lines(side: str, proof: JsonObject, passed_over: int) -> list[str]:
     if not proof["certified"]:
         return [f"{side}: no certificate: {proof['why_none']}."]
-    bounds = {name: _below(value) for name, value in proof["assumptions"].items() if name != "discretisation"}
+    # what is assumed is rounded down
+    bounds = {name: _above(value, -1.0) for name, value in proof["assumptions"].items() if name != "discretisation"}
     search = proof["search"]
     nominal = f", nominal acceleration of {bounds['acceleration']:.4g} rad/s²" if "acceleration" in bounds else ""
     promise = f"{_above(proof['accuracy']):.4g} rad/s"

@@ -12,37 +12,29 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.config import is_boolean
-from jaxbl.files import write_atomic, write_json
+from jaxbl.files import write_atomic
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 
 from .maps import value_label
-from .panels import (
-    BLUE,
-    Axis,
-    Figure,
-    Panel,
-    Span,
-    intervals,
-    name_rows,
-)
+from .panels import BLUE, Axis, Figure, Panel, Span, intervals, name_rows
 
 _ROWS = 12
 """Metrics of the figure."""
 
 
 def write(comparison: Comparison, folder: Path) -> str:
-    """Write `comparison.json`, the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
+    """Write the common points (`comparison.parquet`) and the first study. Returns the study's TOML."""
     tabulate_points(comparison).to_parquet(folder / "comparison.parquet")
-    write_atomic(folder / "study.toml", comparison.first_config.to_toml())
-    write_json(folder / "comparison.json", comparison.to_dict())
-    return comparison.first_config.to_toml()
+    study = comparison.first_config.to_toml()
+    write_atomic(folder / "study.toml", study)
+    return study
 
 
 def tabulate_points(comparison: Comparison) -> pd.DataFrame:
     """The common points with each metric that changed: `first`, `second`, and the `factor` between them (of what is true or
     false, the difference of the shares)."""
-    columns: dict[str, Any] = {}
+    columns = {}
     for change in comparison.metrics:
         if change.count:
             frame = comparison.frame(change.metric)
@@ -73,19 +65,17 @@ def describe(comparison: Comparison) -> Result:
         f"{name} is not finished: {there} of {total} runs are compared."
         for name, (there, total) in comparison.unfinished.items()
     ]
-    if not comparison.config:
-        remarks.append("The configs differ in nothing that decides a number.")
-    if comparison.made_by:
-        changes = ", ".join(f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.made_by.items())
-        remarks.append(f"Computed by: {changes}.")
+    changes = ", ".join(f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.made_by.items())
     alone = f"; {first} in the first alone, {second} in the second alone" if first or second else ""
-    remarks.append(f"Points: {common} in both{alone}.")
-    if common:
-        remarks.append(_noise(comparison))
+    remarks += [
+        "" if comparison.config else "The configs differ in nothing that decides a number.",
+        changes and f"Computed by: {changes}.",
+        f"Points: {common} in both{alone}.",
+        _noise(comparison) if common else "",
+    ]
     for i, study in enumerate(names):
-        gone = [f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i]]
-        if gone:
-            remarks.append(f"A number in {study} alone: {', '.join(gone)}.")
+        gone = ", ".join(f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i])
+        remarks.append(gone and f"A number in {study} alone: {gone}.")
     figures = [KeyFigure(_factor(change), f"{change.metric}: {_ways(change)}") for change in changed[:4]]
     rows = [[key, _value(old), _value(new)] for key, (old, new) in comparison.config.items()]
     tables = [ResultTable("What differs in the config", ["key", *names], rows)] * bool(rows)
@@ -96,7 +86,7 @@ def describe(comparison: Comparison) -> Result:
             for change in changed
         ]
         tables.append(ResultTable("Metrics that differ", head, rows))
-    return Result(f"{names[0]} and {names[1]}", verdict, headline, figures, remarks, tables=tables)
+    return Result(f"{names[0]} and {names[1]}", verdict, headline, figures, [*filter(None, remarks)], tables=tables)
 
 
 def _noise(comparison: Comparison) -> str:

@@ -18,8 +18,8 @@ from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records.least_squares import rms
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_table, write_fit
+from .identify import draw_motor_alone
+from .numbers import lead_with_doubt, number_table, write as write
 from .panels import (
     BLUE,
     MISSING,
@@ -32,7 +32,6 @@ from .panels import (
     Figure,
     Line,
     Panel,
-    Part,
     Span,
     cloud,
     intervals,
@@ -40,23 +39,17 @@ from .panels import (
     with_unit,
 )
 
-_BEFORE, _AFTER = VERMILION, BLUE
 _CHANNELS = {
     "theta_e": "motor position", "theta_s": "load position", "velocity_motor": "motor speed", "velocity_load": "load speed",
     "torque_motor": "motor: missing torque", "torque_load": "load: missing torque",
 }  # fmt: skip
 
 
-def write(result: Diagnosis, folder: Path) -> str:
-    """Write `diagnosis.json`, `model.toml` and `trace.parquet`. Returns the TOML of the extended model."""
-    return write_fit(result, folder, "diagnosis")
-
-
 def describe(summary: JsonObject) -> Result:
     """Say what the model lacks, how sure that is, and how much better it is with it, from a `diagnosis.json`."""
     verdict, headline = _verdict(summary)
-    tables = [_history_table(summary)] * bool(summary["history"])
-    tables += [
+    tables = [
+        *[_history_table(summary)] * bool(summary["history"]),
         _gap_table(summary["gap"]),
         number_table("Parameters of the model", read_quantities(summary["parameters"])),
     ]
@@ -154,8 +147,10 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
             f"By the log the model lacks {names}, but it predicts the held-out data worse with {_them(summary)}.",
         )
     quantity = "missing torque" if "backlash" not in summary else "motor's squared prediction error beyond noise"
+    share = summary["explained_share"] or 0.0
+    text = f"{100.0 * share:.{0 if share < 0.99 else 1}f} %" if share <= 0.999 else "more than 99.9 %"
     return "doubtful", (
-        f"The model lacks {names}, but that is not all: on held-out data {_share(summary['explained_share'])} of the "
+        f"The model lacks {names}, but that is not all: on held-out data {'none' if share < 0.005 else text} of the "
         f"{quantity} is explained."
     )
 
@@ -210,12 +205,6 @@ def _table_lines(summary: JsonObject) -> Lines:
     return [f"Not named, but in model.toml as tables: {_join_words(torques)}{than}."]
 
 
-def _share(value: float | None) -> str:
-    if not value or value < 0.005:
-        return "none"
-    return "more than 99.9 %" if value > 0.999 else f"{100.0 * value:.{0 if value < 0.99 else 1}f} %"
-
-
 def _names(summary: JsonObject) -> str:
     """Names of the effects that were found, as in a sentence; what may as well be something unknown is there perhaps."""
     names = []
@@ -254,9 +243,9 @@ def _failed_checks(summary: JsonObject) -> Lines:
 
 def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
     """Return of each channel the failed test that shows it best, its error and limit."""
-    errors, best = _errors_of_channels(gap), dict[str, tuple[str, Any, Any]]()
+    errors, best = _errors_of_channels(gap), {}
     tests = [(name, errors[name][1], errors[name][3]) for name in gap["test"]["failed"]]
-    for test in sorted(tests, key=lambda test: _ratio(*test[1:]), reverse=True):
+    for test in sorted(tests, key=lambda test: -_ratio(*test[1:])):
         best.setdefault(test[0].split()[0], test)
     return [*best.values()]
 
@@ -282,10 +271,8 @@ def rms_text(value: float | None) -> str:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines = []
-    if summary["verdict"] != "unknown_effect" or summary["findings"]:
-        lines += [f"Residual of the model as given: {side['sentence']}." for side in summary["where"].values()]
-    return [*lines, *summary["notes"]]
+    where = summary["where"] if summary["verdict"] != "unknown_effect" or summary["findings"] else {}
+    return [*(f"Residual of the model as given: {side['sentence']}." for side in where.values()), *summary["notes"]]
 
 
 def _ratio(error: float | None, other: float | None) -> float:
@@ -341,8 +328,13 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
         for before, after, held in pieces:
             if held and not all(other for _, _, other in pieces):
                 parts.append(Span(before.time[0], before.time[-1], "held out", ORANGE, opacity=0.18))
-            parts += torque_parts(before, bandwidth, "before", noise=False, colour=_BEFORE, width=2.6, opacity=0.6)
-            parts += torque_parts(after, bandwidth, "after", colour=_AFTER, width=0.9)
+            # behind the low-pass that the analysis used
+            (first, _), (last, _) = (narrow(residual, bandwidth) for residual in (before, after))
+            parts += [
+                Line(first.time, first.torque, "before", VERMILION, 2.6, opacity=0.6),
+                Band(last.time, -2.0 * last.deviation, 2.0 * last.deviation, "± 2 noise", MISSING, 0.75),
+                Line(last.time, last.torque, "after", BLUE, 0.9),
+            ]
         panels.append(Panel(TIME, Axis(missing_label(f"{side}:\n", unit)), parts))
     lead = f"Held-out log {diagnosis.holdout.path.name}: t" if diagnosis.summary["gap"]["holdout"]["separate"] else "T"
     caption = (
@@ -355,13 +347,6 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
 _SHOWN = ("speed", "turn", "load turn", "position", "load position", "twist", "acceleration")
 _PANELS = 3
 """Coordinates that are drawn: as many as are wide enough side by side."""
-
-
-def torque_parts(residual: Residual, bandwidth: float, name: str, *, noise: bool = True, **how: Any) -> list[Part]:
-    """A residual over time behind the low-pass that the analysis used, and its noise as a band."""
-    low, _ = narrow(residual, bandwidth)
-    band = [Band(low.time, -2.0 * low.deviation, 2.0 * low.deviation, "± 2 noise", MISSING, 0.75)]
-    return [*band * noise, Line(low.time, low.torque, name, **how)]
 
 
 def draw_residual(
@@ -382,7 +367,7 @@ def draw_residual(
     lows, rows = zip(*(narrow(part, located.bandwidth) for part in parts), strict=True)
     torque = np.concatenate([low.torque for low in lows])
     noise = rms(np.concatenate([low.deviation for low in lows]))
-    limit = 1.15 * max(float(np.quantile(np.abs(torque), 0.998)), 2.5 * noise)
+    limit = 1.15 * max(np.quantile(np.abs(torque), 0.998), 2.5 * noise)
     y, panels = Axis(missing_label(f"{located.name}: ", unit), ends=(-limit, limit)), []
     for name in sorted(drawn, key=names.index):
         coordinate = by_name[name]

@@ -2,11 +2,9 @@
 
 import base64
 import contextlib
-import itertools
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +26,6 @@ from jaxbl.json_types import JsonObject
 from .panels import (
     BLACK,
     MISSING,
-    Axis,
     Band,
     Bars,
     Figure,
@@ -61,6 +58,8 @@ _SETTINGS: Any = {
     "figure.constrained_layout.use": True,
     "savefig.dpi": 150,
     "svg.fonttype": "path",
+    # names are no mathematics
+    "text.parse_math": False,
 }
 _NAME, _HALO, _NAME_SIZE = "#111111", "#fefefe", 8.5
 """Of names that are written along lines: colours, and size in points."""
@@ -156,15 +155,14 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     scales = _scales(panels)
     shared = len(scales) == 1
     # one legend for all panels where one of them has all names, for maps, and where a second scale stands above
-    below = dict(itertools.chain(*(handles.items() for handles in names)))
+    below = {name: handle for handles in names for name, handle in handles.items()}
     if not scales and len(below) > max(map(len, names)) and not any(panel.x.ratio for panel in panels):
         below = {}
     fit, height = _size_legend(below, figure.width)
     foot = height + 0.1 if below else 0.0
     canvas = Canvas(figsize=(figure.width, figure.height * rows + foot), layout="none")  # pyright: ignore[reportArgumentType]
     grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*[1.0] * columns, *[0.035 * columns] * shared])
-    axes: list[Axes] = []
-    axes_by_axis: dict[tuple[str, Axis], Axes] = {}
+    axes, axes_by_axis = [], {}
     for i, panel in enumerate(panels):
         how = {f"share{name}": axes_by_axis.get((name, axis)) for name, axis in panel.axes.items() if axis.label}
         ax = canvas.add_subplot(grid[i // columns, i % columns], **how)
@@ -172,7 +170,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
         axes.append(ax)
         _draw_panel(ax, panel)
         above = 0.0 if below else _legend_above(ax, names[i], figure.width / columns)
-        ax.set_title(_plain(panel.title), loc="left", pad=6.0 + 72.0 * above)
+        ax.set_title(panel.title, loc="left", pad=6.0 + 72.0 * above)
         # the panels below and on the left, on which the same axis stands
         neighbours = {"x": panels[i + columns :][:1], "y": panels[i - 1 : i] if i % columns else ()}
         for name, axis in panel.axes.items():
@@ -185,7 +183,7 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     if shared:
         _draw_bar(canvas, scales[0], cax=canvas.add_subplot(grid[:, columns]))
     if below:
-        canvas.legend(below.values(), map(_plain, below), loc="lower center", ncols=fit)
+        canvas.legend(below.values(), below, loc="lower center", ncols=fit)
     # before each drawing: what writes SVG would lay out anew, without room for the legend below
     canvas.set_layout_engine(TightLayoutEngine(pad=0.5, rect=(0.0, foot / canvas.get_figheight(), 1.0, 1.0)))
     return canvas, axes
@@ -193,13 +191,8 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
 
 def _scales(panels: Sequence[Panel]) -> list[Scale]:
     """Scales of maps that have a colour bar."""
-    parts = itertools.chain(*(panel.parts for panel in panels))
-    return list(dict.fromkeys(part.scale for part in parts if isinstance(part, Map) and part.scale.label))
-
-
-def _plain(text: str) -> str:
-    """A text without mathematical type."""
-    return text.replace("$", r"\$")
+    maps = (part for panel in panels for part in panel.parts if isinstance(part, Map) and part.scale.label)
+    return list(dict.fromkeys(part.scale for part in maps))
 
 
 def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
@@ -211,15 +204,17 @@ def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
 def _legend_above(ax: Axes, handles: dict[str, Any], width: float) -> float:
     """Draw a legend above the axes, where it hides no line. Returns its height, inches."""
     fit, height = _size_legend(handles, width - 0.6)
-    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1, "columnspacing": 1.2}
     if handles:
-        ax.legend(handles.values(), map(_plain, handles), ncols=fit, **place)
+        ax.legend(
+            handles.values(), handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=fit, borderaxespad=0.1,
+            columnspacing=1.2,
+        )  # fmt: skip
     return height
 
 
 def _draw_bar(canvas: Canvas, scale: Scale, **where: Any) -> None:
     """Draw the colour bar of a scale."""
-    label = "\n".join(textwrap.wrap(_plain(scale.label), 44))
+    label = "\n".join(textwrap.wrap(scale.label, 44))
     bar = canvas.colorbar(ScalarMappable(_norm(scale), scale.colours), label=label, **where)
     bar.outline.set_visible(False)  # type: ignore[operator]
     if scale.log:
@@ -240,7 +235,7 @@ def _set_log_ticks(axis: Any, low: float, high: float) -> None:
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     """Draw the parts of a panel, and set up its axes."""
     for name, axis in panel.axes.items():
-        ax.set(**{f"{name}label": _plain(axis.label), f"{name}scale": "log" if axis.log else "linear"})
+        ax.set(**{f"{name}label": axis.label, f"{name}scale": "log" if axis.log else "linear"})
         if axis.ends is not None:
             ax.set(**{f"{name}lim": axis.ends})
     box = ax.get_position()
@@ -248,14 +243,14 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     ticks = {"x": int(np.clip(1.4 * width * box.width, 2, 8)), "y": int(np.clip(2.5 * height * box.height, 2, 6))}
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
-        _DRAWERS[type(part)](ax, part, 1.0 + layer / len(panel.parts))
+        _DRAWERS[type(part)](ax, thin(part), 1.0 + layer / len(panel.parts))
     _name_lines(ax, [part for part in panel.parts if isinstance(part, Line) and part.at_line and len(part.x) > 1])
     ax.grid(not any(isinstance(part, Map) for part in panel.parts))
     for name, axis in panel.axes.items():
         drawn = getattr(ax, f"{name}axis")
         if axis.names:
             places, texts = zip(*axis.names, strict=True)
-            drawn.set_ticks(places, map(_plain, texts))
+            drawn.set_ticks(places, texts)
             drawn.grid(False)
         elif axis.log:
             _set_log_ticks(drawn, *getattr(ax, f"get_{name}lim")())
@@ -267,7 +262,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
 
 def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
     """Draw the second scale of an axis, on the top or on the right."""
-    scales = partial(np.multiply, 1.0 / unit), partial(np.multiply, unit)
+    scales = lambda values: values / unit, lambda values: values * unit
     second = getattr(ax, f"secondary_{name}axis")({"x": "top", "y": "right"}[name], functions=scales)
     axis = getattr(second, f"{name}axis")
     axis.set_label_text(label)
@@ -276,24 +271,24 @@ def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
 
 
 def _line_look(line: Line) -> dict[str, Any]:
-    look = {"ls": line.dashes if line.width else "", "lw": line.width, "color": line.colour, "marker": line.marker}
-    edge = line.colour if line.marker in "x|+" or line.fill else line.fill or "none"
-    return look | {"ms": line.size, "mfc": line.fill or line.colour, "mec": edge, "mew": 1.1 if line.fill else 1.0}
+    return {
+        "ls": line.dashes if line.width else "", "lw": line.width, "color": line.colour, "marker": line.marker,
+        "ms": line.size, "mfc": line.fill or line.colour, "mew": 1.1 if line.fill else 1.0,
+        "mec": line.colour if line.marker in "x|+" or line.fill else "none",
+    }  # fmt: skip
 
 
 def _draw_line(ax: Axes, line: Line, layer: float) -> None:
-    line = thin(line)  # type: ignore[assignment]
     if line.held:
         x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
         line = line._replace(x=x, y=y)
-    look: Any = {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
-    (artist,) = ax.plot(line.x, line.y, **_line_look(line), **look)
+    look = _line_look(line) | {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
+    (artist,) = ax.plot(line.x, line.y, **look)
     # one by one, markers would be larger than an image of them
     artist.set_rasterized(bool(line.marker) and len(line.x) > 800)
-    centred: Any = {"ha": "center", "va": "center"}
-    beside: Any = {"va": "center", "xytext": (6, 0), "textcoords": "offset points"}
+    place: Any = {"xytext": (6, 0), "textcoords": "offset points"} if line.marker else {"ha": "center"}
     for x, y, text in zip(line.x, line.y, line.texts):  # noqa: B905
-        ax.annotate(_plain(text), (x, y), fontsize=8, zorder=6, **(beside if line.marker else centred))
+        ax.annotate(text, (x, y), va="center", fontsize=8, zorder=6, **place)
 
 
 def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
@@ -314,7 +309,7 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
             i = int(np.argmax(worth))
             turn = float(np.arctan2(*(last - first)[i, ::-1]))
             name = ax.annotate(
-                _plain(line.name), tuple(ax.transData.inverted().transform(middle[i])),
+                line.name, tuple(ax.transData.inverted().transform(middle[i])),
                 (-3.0 * np.sin(turn), 3.0 * np.cos(turn)),
                 textcoords="offset points", fontsize=_NAME_SIZE, ha="center", va="bottom", zorder=6, color=_NAME,
                 rotation=np.degrees(turn), rotation_mode="anchor",
@@ -332,7 +327,6 @@ def _follow(ax: Axes, line: Line) -> np.ndarray:
 
 
 def _draw_band(ax: Axes, band: Band, layer: float) -> None:
-    band = thin(band)  # type: ignore[assignment]
     ax.fill_between(band.x, band.low, band.high, color=band.colour, alpha=band.opacity, lw=0.0, zorder=layer)
 
 
@@ -356,7 +350,7 @@ def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
 def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
     ax.barh(bars.places, bars.lengths, bars.thickness, color=bars.colour, alpha=bars.opacity, zorder=layer)
     for place, length, text in zip(bars.places, bars.lengths, bars.texts):  # noqa: B905
-        ax.annotate(f" {_plain(text)}", (length, place), va="center", fontsize=9)
+        ax.annotate(f" {text}", (length, place), va="center", fontsize=9)
 
 
 _DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _draw_map, Bars: _draw_bars}
@@ -364,15 +358,15 @@ _DRAWERS: Any = {Line: _draw_line, Band: _draw_band, Span: _draw_span, Map: _dra
 
 def _legend_handles(panel: Panel) -> dict[str, Any]:
     """The legend's handle of each name in a panel that does not stand beside its line."""
-    handles: dict[str, Any] = {}
+    handles = {}
     for part in panel.parts:
         is_hidden = part.at_line if isinstance(part, Line) else isinstance(part, Map) and not np.any(part.failed)
         if is_hidden or not part.name or part.name in handles:
             continue
+        if isinstance(part, Span) and part.low == part.high:
+            part = Line([], [], part.name, part.colour, part.width, part.dashes)
         if isinstance(part, Line):
             handles[part.name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
-        elif isinstance(part, Span) and part.low == part.high:
-            handles[part.name] = Line2D([], [], color=part.colour, lw=part.width, ls=part.dashes)
         else:
             handles[part.name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
     return handles

@@ -10,14 +10,14 @@ from jaxbl.lines import Lines, percent
 from jaxbl.quantity import read_quantities
 from jaxbl.result import Result
 
-from .numbers import lead_with_doubt, number_figures, number_table, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write as write_fit
 from .panels import BLUE, ORANGE, Axis, Figure, Panel, Span, cloud, draw_signals, missing_quantity
 
 
 def write(result: ElementIdentification, folder: Path) -> str:
-    """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the TOML of the transmission."""
+    """Write `model.toml` and `trace.parquet`. Returns the TOML of the transmission."""
     model = "# Of a transmission alone: a study with [drive] can include it.\n" + tomli_w.dumps(result.tables)
-    return write_fit(result, folder, "identification", model)
+    return write_fit(result, folder, model)
 
 
 def describe(summary: JsonObject) -> Result:
@@ -58,15 +58,16 @@ def draw(result: ElementIdentification) -> list[Figure]:
     trace, record, numbers = result.trace, result.task.record, result.element.numbers
     unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))
     time, x, u, fitted = (trace[name].to_numpy() for name in ("t", "displacement", "u", "torque"))
-    parts, gap = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)], []
+    parts = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)]
     if {"half_gap", "centre"} <= numbers.keys():
         middle, half = numbers["centre"].value, numbers["half_gap"].value
-        gap = [Span(middle - half, middle + half, "gap", ORANGE)]
+        parts += [Span(middle - half, middle + half, "gap", ORANGE)]
     axes = Axis(f"displacement ({unit})"), Axis(f"{missing_quantity(torque_unit)} ({torque_unit})")
-    loop = Panel(*axes, [*parts, *gap])
     signals = (u, "torque", torque_unit, BLUE), (u - fitted, "not explained", torque_unit, BLUE)
     panels = draw_signals(time, record.segments, signals)
     return [
-        Figure("loop", [loop], "Torque over displacement: as measured, and of the transmission that was found."),
+        Figure(
+            "loop", [Panel(*axes, parts)], "Torque over displacement: as measured, and of the transmission that was found."
+        ),
         Figure("residual", panels, "The torque over time, and what of it is not explained.", height=1.7),
     ]

@@ -25,6 +25,7 @@ class ErrorPath(NamedTuple):
         peaks: of the velocity error (rad/s), one a half cycle.
         ratio: of a peak to the one before, by the majorant (37); None where there is none.
         majorant: e (rad) and its slope (rad/s) along (36), from the first peak; empty where there is none.
+        reach: how far the axes of both go from zero; 0 where no finite error says so.
     """
 
     error: Array
@@ -32,6 +33,7 @@ class ErrorPath(NamedTuple):
     peaks: Array
     ratio: float | None
     majorant: tuple[Array, Array]
+    reach: list[float]
 
 
 def error_path(trace: DataFrame, side: str, judged: JsonObject) -> ErrorPath:
@@ -44,10 +46,22 @@ def error_path(trace: DataFrame, side: str, judged: JsonObject) -> ErrorPath:
     samples, peaks = error_peaks(error, rate, _MOST_PEAKS)
     end = samples[-1] + 2 if len(samples) > 1 else len(error)
     drawn = np.unique(np.linspace(0, end - 1, min(end, _MOST_POINTS)).astype(int))
+    path = error[drawn], slope[drawn]
     least = judged["least_lambda"]["davila_fridman"]
     ratio = None if least is None or lambda_ == 0.0 else least / lambda_
     curve = (np.zeros(0), np.zeros(0)) if ratio is None or not len(peaks) else majorant(peaks[0], *gains)
-    return ErrorPath(error[drawn], slope[drawn], peaks, ratio, curve)
+    reach = [_reach(*values) for values in zip(path, curve, strict=True)]
+    return ErrorPath(*path, peaks, ratio, curve, reach)
+
+
+def _reach(error: Array, majorant: Array) -> float:
+    """The distance that an axis of the phase plane goes from zero; 0 where no finite error says so."""
+    reach = np.nanmax(np.abs(error), initial=0.0)
+    if not np.isfinite(reach):
+        return 0.0
+    # a majorant far outside would leave nothing of the error to be seen
+    largest = np.abs(majorant).max(initial=reach)
+    return 1.1 * (largest if largest < 4.0 * reach else 1.2 * reach)
 
 
 def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]:
@@ -59,7 +73,7 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
         side: motor or load.
         judged: gains, f_plus, and what follows from them (`conditions` of the run's summary).
     """
-    error, slope, peaks, ratio, curve = error_path(trace, side, judged)
+    error, slope, peaks, ratio, curve, reaches = error_path(trace, side, judged)
     lambda_, alpha, bound = (judged[name] for name in ("lambda", "alpha", "f_plus"))
     if len(peaks) < 2:
         return []
@@ -68,7 +82,6 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
     parts = [Line(error, slope, name, VERMILION, 1.2)]
     if len(curve[0]):
         parts.append(Line(*curve, f"majorant (36)-(37): ratio {ratio:.3g}", width=1.0))
-    reaches = [plane_reach(*values) for values in zip((error, slope), curve, strict=True)]
     labels = "position error e (rad)", "its slope ė (rad/s)"
     x, y = (Axis(label, ends=(-reach, reach) if reach else None) for label, reach in zip(labels, reaches, strict=True))
     reason = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
@@ -81,13 +94,3 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
             f"friction; a ratio below 1 proves convergence.{reason}",
         )
     ]
-
-
-def plane_reach(error: Array, majorant: Array) -> float:
-    """The distance that an axis of the phase plane goes from zero; 0 where no finite error says so."""
-    reach = float(np.nanmax(np.abs(error), initial=0.0))
-    if not np.isfinite(reach):
-        return 0.0
-    # a majorant far outside would leave nothing of the error to be seen
-    largest = max(reach, float(np.abs(majorant).max(initial=0.0)))
-    return 1.1 * (largest if largest < 4.0 * reach else 1.2 * reach)

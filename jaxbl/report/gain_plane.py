@@ -56,7 +56,7 @@ def gain_axes(bound: float, alphas: Pair, lambdas: Pair) -> tuple[Axis, Axis]:
     """Axes of alpha (rad/s²) along x and lambda (√rad/s) along y; on the other sides stand α / f⁺ and λ / √f⁺."""
     return (
         Axis("α, switching gain (rad/s²)", log=True, ends=alphas, ratio=(bound, "α / f⁺")),
-        Axis("λ, correction gain (√rad/s)", log=True, ends=lambdas, ratio=(float(np.sqrt(bound)), "λ / √f⁺")),
+        Axis("λ, correction gain (√rad/s)", log=True, ends=lambdas, ratio=(np.sqrt(bound), "λ / √f⁺")),
     )
 
 
@@ -96,9 +96,12 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
     _, exact = condition_curves(EXACT, bound, alphas)
     # α has to exceed f⁺, whatever λ is
     x, y = [alphas[0], exact.x[0], *exact.x], [lambdas[1], lambdas[1], *exact.y]
-    parts = [Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6), exact._replace(colour="#000000", at_line=False)]
-    parts.append(usual_rule_curve(bound, alphas))
-    parts.append(mark(alpha, lambda_, "the observer's gains"))
+    parts = [
+        Band(x, np.full(len(x), lambdas[0]), y, "fails", MISSING, 0.6),
+        exact._replace(colour="#000000", at_line=False),
+        usual_rule_curve(bound, alphas),
+        mark(alpha, lambda_, "the observer's gains"),
+    ]
     caption = (
         f"Gains of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) and the least λ of the exact "
         f"condition at the true f⁺ = {bound:.3g} rad/s² along the run; the usual rule's gains for this f⁺ and larger ones. "

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +16,12 @@ from jaxbl.lines import DOUBT, Lines, percent
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records.linear_filters import filter_forwards
 from jaxbl.records.signal_quality import longest_segment
-from jaxbl.result import KeyFigure, Result, ResultTable
+from jaxbl.result import KeyFigure, Result
 
-from .motor_alone_figures import draw_motor_alone
-from .numbers import lead_with_doubt, number_figures, number_table, write_fit
+from .numbers import lead_with_doubt, number_figures, number_table, write as write
 from .panels import (
     BLACK,
+    BLUE,
     GREEN,
     PURPLE,
     SIDE_COLOURS,
@@ -41,11 +42,6 @@ from .panels import (
 )
 
 
-def write(result: Identification, folder: Path) -> str:
-    """Write `identification.json`, `model.toml` and `trace.parquet`. Returns the model's TOML."""
-    return write_fit(result, folder, "identification")
-
-
 def describe(summary: JsonObject) -> Result:
     """Say whether the model explains the log, and which numbers it has, from an `identification.json`."""
     parameters = read_quantities(summary["parameters"])
@@ -58,7 +54,9 @@ def describe(summary: JsonObject) -> Result:
     elif not complete:
         verdict = "doubtful"
         headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
-    tables = [_parameter_table(summary, parameters)]
+    heading = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
+    profiles = {path: number.get("profile_interval") for path, number in summary["parameters"].items()}
+    tables = [number_table(heading, parameters, profiles)]
     remarks = [*summary["warnings"], *_far_off(parameters)]
     if lacks := (summary.get("rejected") or {}).get("lacks"):
         remarks.append(
@@ -99,26 +97,24 @@ def _backlash(summary: JsonObject) -> list[KeyFigure]:
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    lines, unseen = [], (summary.get("backlash") or {}).get("why")
+    fit, unseen = summary["method"]["trajectory"], (summary.get("backlash") or {}).get("why")
+    lines = []
     for refusal in summary["refused"]:
-        if refusal["why"] == unseen:
-            continue
         shares = ", ".join(f"{path} {share:+.2f}" for path, share in refusal["direction"].items())
-        lines.append(f"Not identifiable: {shares}: {refusal['why']}.")
-    if summary["held"]:
-        lines.append(f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.")
-    lines += (line for _, line in _describe_residuals(summary))
-    fit = summary["method"]["trajectory"]
-    lines.append(
-        "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
-        if "backlash" in summary
-        else f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
+        lines.append(refusal["why"] != unseen and f"Not identifiable: {shares}: {refusal['why']}.")
+    how = (
+        f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
         f"{fit['starts']} starts agree."
     )
-    if not fit["converged"]:
-        lines.append("The fit stopped before it reached its tolerance.")
-    if summary["torque"]:
-        lines.append(f"Torque error of the model, rms: {_shares(summary['torque'])}.")
+    if "backlash" in summary:
+        how = "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
+    lines += [
+        summary["held"] and f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.",
+        *(line for _, line in _describe_residuals(summary)),
+        how,
+        not fit["converged"] and "The fit stopped before it reached its tolerance.",
+        summary["torque"] and f"Torque error of the model, rms: {_shares(summary['torque'])}.",
+    ]
     for side, gains in summary.get("gains", {}).items():
         error = gains["velocity_error"]
         lines.append(
@@ -129,7 +125,7 @@ def _remarks(summary: JsonObject) -> Lines:
         )
     if "holdout" in summary:
         lines += _on_holdout(summary["holdout"])
-    return [*lines, *summary["notes"]]
+    return [*filter(None, lines), *summary["notes"]]
 
 
 def _describe_residuals(summary: JsonObject) -> list[tuple[bool, str]]:
@@ -171,53 +167,40 @@ def _on_holdout(holdout: JsonObject) -> Lines:
     return lines
 
 
-def _parameter_table(summary: JsonObject, parameters: Mapping[str, Quantity]) -> ResultTable:
-    title = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
-    table = number_table(title, parameters)
-    profiles = [number.get("profile_interval") for number in summary["parameters"].values()]
-    if not any(profiles):
-        return table
-    rows = [[*row, *(profile or (None, None))] for row, profile in zip(table.rows, profiles, strict=True)]
-    return ResultTable(title, [*table.columns, "by profile from", "to"], rows)
-
-
 _SETTLING = 0.1
 """Share of the record left to the observers to converge: shown, but not in rms values and scales."""
 
 
 class LogSignals:
-    """Signals of a log, of the observers that ran on it and of the fitted model, as the figures compare them.
+    """Signals of a log's longest part without gaps, which the observers ran on, and of the fitted model, as the figures
+    compare them.
 
     Attributes:
         sides: that have an observer.
         unit: of positions, by side.
-        observed: the longest part without gaps, which the observers ran on.
-        settled: the observed part without its beginning, in which the observers converge.
+        settled: the rows without those at the beginning, in which the observers converge.
     """
 
     def __init__(self, result: Identification):
-        self.result, self.trace, self.record = result, result.trace, result.record
+        self.record = result.record
+        self.trace = result.trace.iloc[longest_segment(self.record.segments)]
         self.sides = [side for side in SIDES if f"{side}.velocity" in self.trace]
         self.unit = {side: self.record.unit_of(f"{side}.position", "rad") for side in self.sides}
         self.torque_unit = self.record.unit_of("motor.torque", "N m")
         experiment = result.model.build()
         self.plant, self.time_constant = experiment.plant, float(experiment.equivalent_control.time_constant)
-        self.observed = longest_segment(self.record.segments)
-        first, last = self.observed.start, self.observed.stop
-        self.settled = slice(first + int(_SETTLING * (last - first)), last)
+        self.settled = slice(int(_SETTLING * len(self.trace)), None)
 
     def __getitem__(self, name: str) -> Array:
         """A column of the trace."""
         return self.trace[name].to_numpy(dtype=float)
 
     def low_passed(self, values: Array) -> Array:
-        """Values behind the low-pass of the equivalent control, for the same lag; NaN outside the observed part."""
-        filtered, part = np.full(len(values), np.nan), values[self.observed]
-        if self.time_constant > 0.0 and np.isfinite(part).all():
-            share = -np.expm1(-self.record.sample_period / self.time_constant)
-            part = filter_forwards(part, [share], [share - 1.0])
-        filtered[self.observed] = part
-        return filtered
+        """Values behind the low-pass of the equivalent control, for the same lag."""
+        if self.time_constant == 0.0 or not np.isfinite(values).all():
+            return values
+        share = -np.expm1(-self.record.sample_period / self.time_constant)
+        return filter_forwards(values, [share], [share - 1.0])
 
     def law_at(self, twist: Array) -> Array:
         """Torque of the fitted transmission at rest, without transmission errors."""
@@ -229,10 +212,9 @@ class LogSignals:
         )
         plant = dataclasses.replace(self.plant, effects=effects)
         with jax.enable_x64(True):
-            still = {side: jnp.asarray(0.0) for side in SIDES}
+            still = {side: jnp.zeros(len(twist)) for side in SIDES}
             states = tuple(effect.init() for effect in effects)
-            position = {"motor": jnp.asarray(twist), "load": jnp.zeros(len(twist))}
-            torque, _ = jax.vmap(lambda angles: plant.transmitted_torque(angles, still, states))(position)
+            torque, _ = plant.transmitted_torque(still | {"motor": jnp.asarray(twist)}, still, states)
         return np.asarray(torque)
 
     def torque_by(self, side: str) -> Array:
@@ -245,23 +227,22 @@ class LogSignals:
 
 def draw(result: Identification) -> list[Figure]:
     """All figures of an identification."""
-    log = LogSignals(result)
     if "backlash" in result.summary:
-        return [draw_motor_alone(result), _residuals(log)]
+        return [draw_motor_alone(result), _residuals(result)]
     # a load with an encoder of its own has a twist
-    first = _hysteresis if "twist" in log.trace else _friction
-    return [first(log), _residuals(log)]
+    first = _hysteresis if "twist" in result.trace else _friction
+    return [first(LogSignals(result)), _residuals(result)]
 
 
-def _residuals(log: LogSignals) -> Figure:
+def _residuals(result: Identification) -> Figure:
     panels = []
-    for side, sizes in log.result.summary["residual"].items():
-        unit, rms, noise = log.unit[side], sizes["rms"], sizes["noise"]
-        name = f"rms {rms:.2g} {unit}, {rms / noise:.3g} times the noise"
-        time, residual = join(log["t"], log.record.segments, log[f"{side}.residual"])
+    for side, sizes in result.summary["residual"].items():
+        noise = sizes["noise"]
+        name = f"rms {sizes['rms']:.2g} {sizes['unit']}, {sizes['rms'] / noise:.3g} times the noise"
+        time, residual = join(result.trace["t"], result.record.segments, result.trace[f"{side}.residual"])
         line = Line(time, residual, name, SIDE_COLOURS[side], 0.7)
         limits_of_noise = [Span(end, end, "± 2 noise", along="y", width=0.9) for end in (-2.0 * noise, 2.0 * noise)]
-        panels.append(Panel(TIME, Axis(f"{side}: measured\n− model ({unit})"), [line, *limits_of_noise]))
+        panels.append(Panel(TIME, Axis(f"{side}: measured\n− model ({sizes['unit']})"), [line, *limits_of_noise]))
     return Figure(
         "residuals",
         panels,
@@ -337,4 +318,25 @@ def _friction(log: LogSignals) -> Figure:
         f"The {quantity} beyond inertia and viscous friction over velocity, behind the same low-pass: friction as the log "
         "shows it (grey: samples by the observer, without the first tenth; lines: their means for either direction of the "
         "acceleration), and as fitted. The low-pass slants the reversals.",
+    )
+
+
+def draw_motor_alone(result: Any) -> Figure:
+    """Draw what the motor alone shows in an `Identification` or a `Diagnosis`: the torque in the gear over the twist, by
+    the motor's side and of the model, with the gap if there is one."""
+    unit, torque_unit = result.record.unit_of("motor.position", "rad"), result.record.unit_of("motor.torque", "N m")
+    trace, gap = result.trace.iloc[len(result.trace) // 10 :], result.summary["backlash"]
+    ratio = float(result.model.build().plant.drive.ratio("load"))
+    twist = (trace["theta_e"] - ratio * trace["load.modelled_position"]).to_numpy()
+    by_motor, law = trace["torque_by_motor"].to_numpy(), trace["torque"].to_numpy()
+    half = (gap and gap["half_gap"]) or 0.0
+    clouds = cloud(twist, by_motor, "by the motor's side", BLUE), cloud(twist, law, "model", BLACK)
+    parts = [*shade_gap(half, f"gap: half width {half:.4g} {unit}"), *clouds]
+    x = Axis(f"twist θe − N₀ θs, the load's position by the model ({unit})", ends=limits(twist))
+    return Figure(
+        "hysteresis",
+        [Panel(x, Axis(f"torque in the gear ({torque_unit})", ends=limits(by_motor, law)), parts)],
+        "Torque in the gear over the twist. Blue: what the motor's torque, smoothed acceleration and friction leave for the "
+        "gear, which uses the motor's encoder only. Black: the model. Within the gap the motor drives nothing but itself. "
+        "Smoothing rounds the impacts.",
     )

@@ -5,34 +5,22 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from jaxbl.files import to_jsonable, write_json
 from jaxbl.records import POSITION_CHANNELS, Inspection, Record
 from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .numbers import lead_with_doubt
-from .panels import (
-    BLACK,
-    BLUE,
-    COLOURS,
-    GREEN,
-    PURPLE,
-    VERMILION,
-    Axis,
-    Figure,
-    Panel,
-    cloud,
-    draw_signals,
-)
+from .panels import BLACK, BLUE, COLOURS, GREEN, PURPLE, VERMILION, Axis, Figure, Panel, cloud, draw_signals
 
-_LABELS = {"u": "input u", "theta_e": "motor θe", "theta_s": "load θs", "transmitted": "transmitted"}
-_COLOURS = {"u": BLACK, "theta_e": BLUE, "theta_s": VERMILION, "transmitted": GREEN}
-"""Of channels."""
+_LOOKS = {
+    "u": ("input u", BLACK), "theta_e": ("motor θe", BLUE), "theta_s": ("load θs", VERMILION),
+    "transmitted": ("transmitted", GREEN),
+}  # fmt: skip
+"""Label and colour of each channel."""
 
 
 def write(inspection: Inspection, folder: Path) -> str:
-    """Write `inspection.json`. Returns the `[log]` table as TOML."""
-    write_json(folder / "inspection.json", to_jsonable(inspection.to_dict()))
+    """Return the `[log]` table as TOML."""
     return tomli_w.dumps({"log": inspection.log.model_dump(exclude_none=True)})
 
 
@@ -60,10 +48,7 @@ def describe(inspection: Inspection) -> Result:
         for name, channel in record.statistics.channels.items()
         if name.startswith("theta")
     ]
-    tables = [
-        ResultTable("What the log can identify", ["quantity", "", "why"], judgements),
-        _channel_table(record),
-    ]
+    tables = [ResultTable("What the log can identify", ["quantity", "", "why"], judgements), _channel_table(record)]
     remarks, headline = [*record.warnings, inspection.describe_sizes()], f"The log {'; it '.join(parts)}."
     return lead_with_doubt(Result(record.path.name, verdict, headline, figures, remarks, record.notes, tables))
 
@@ -96,7 +81,7 @@ def _values(record: Record) -> dict[str, np.ndarray]:
 
 def _channels(record: Record) -> Figure:
     side, channels = main_side(record), record.statistics.channels
-    signals = [(signal, _LABELS[name], channels[name].unit, _COLOURS[name]) for name, signal in _values(record).items()]
+    signals = [(signal, _LOOKS[name][0], channels[name].unit, _LOOKS[name][1]) for name, signal in _values(record).items()]
     unit = f"{channels[POSITION_CHANNELS[side]].unit}/s"
     signals.append((compute_velocity(record, side), f"{side} velocity", unit, PURPLE))
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
@@ -111,7 +96,7 @@ def _twist(inspection: Inspection) -> Figure:
     name = "u" if record.transmitted is None else "transmitted"
     torque = _values(record).get(name)
     if torque is not None and np.ptp(torque):
-        over.insert(0, (torque, f"{_LABELS[name]} ({channels[name].unit})"))
+        over.insert(0, (torque, f"{_LOOKS[name][0]} ({channels[name].unit})"))
     rows = np.r_[*record.segments]
     if gearing is not None and gearing.flank == "load":
         split, names = "the side that the load pulls to", ("load on its first side", "on the other")

@@ -35,7 +35,7 @@ def draw(tuning: LoopTuning) -> list[Figure]:
 
 
 def write(tuning: LoopTuning, folder: Path) -> str:
-    """Write `gains.toml` and `tuning.json`. Returns the study's TOML."""
+    """Write `gains.toml`. Returns the study's TOML."""
     summary = tuning.summary
     head = (
         f"# Gains of a loop chosen by 'jaxbl tune'{for_title(summary)}\n# Objective: {summary['objective_metric']}.\n"

@@ -6,8 +6,9 @@
 
 import re
 from collections.abc import Iterable
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import cycle
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -26,22 +27,8 @@ from jaxbl.sweeps.sweep import StudyResult
 from .aggregates import Column, Groups, Rows
 from .checks import MOST_PARTS, check_figures, has_words, values_of
 from .gain_plane import condition_curves
-from .panels import (
-    COLOURS,
-    Array,
-    Axis,
-    Band,
-    Figure,
-    Line,
-    Map,
-    Panel,
-    Part,
-    Scale,
-    arrange,
-    mark,
-    with_unit,
-)
-from .refined_maps import Filling, coarse_axes, on_coarse_values
+from .panels import COLOURS, Array, Axis, Band, Figure, Line, Map, Panel, Scale, arrange, mark, with_unit
+from .refined_maps import Filling
 
 
 def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
@@ -71,7 +58,7 @@ def draw(result: StudyResult) -> list[Figure]:
     specs = config.figures or default_figures(config, result.columns)
     check_figures(config, specs, result.columns)
     points = Points(config)
-    figures: list[Figure] = []
+    figures = []
     runs = sum(map(len, result.batches(["seed"]))) if specs else 0
     unfinished = "" if result.is_finished(runs) else f" The study is not finished: {runs} runs so far, white where none is."
     for i, spec in enumerate(specs):
@@ -96,21 +83,23 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     names = "finite", "converged", "f_plus", "margin_alpha"
     metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
     columns = [*config.axis_paths, "seed", *metrics]
-    random = [axis for axis in config.axes if axis.path in (figure.x, figure.y) and axis.values is None and axis.num is None]
+    drawn = [axis for axis in config.axes if axis.path in (figure.x, figure.y)]
+    random = [axis for axis in drawn if axis.values is None and axis.num is None]
     # about four points in each bin of a map
     bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))
 
+    # of a refined study what lies on the coarse grid along all axes but those drawn
+    starts = {axis.path: axis.start for axis in drawn}
+
     def select(frame: DataFrame) -> DataFrame:
-        frame = on_coarse_values(points, frame, [figure.x, figure.y])
-        frame = filter_rows(frame, resolve_where(config, figure))
+        frame = filter_rows(frame[points.on_coarse_grid(frame.assign(**starts))], resolve_where(config, figure))
         for axis in random:
             middles = axis.model_copy(update={"num": 2 * bins + 1}).grid()[1::2]
             edges = cell_edges(middles, axis.scale == "log")[1:-1]
             frame = frame.assign(**{axis.path: middles[np.searchsorted(edges, frame[axis.path])]})
         return frame
 
-    needs = [*(figure.where or {}), *(axis.path for axis in random), *(columns if points.refinement else ())]
-    return Rows(result, columns, select, needs)
+    return Rows(result, columns, select)
 
 
 _WORDS = {
@@ -137,10 +126,14 @@ def axis_label(config: Config, path: str) -> str:
 
 
 def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -> tuple[Axis, Array]:
-    """An axis of a figure that shows the cells about some values of a study's axis, and their edges."""
-    log = is_log(config, path, values) if log is None else log
+    """An axis of a figure that shows the cells about some values of a study's axis, which rise, and their edges; it is
+    logarithmic as declared, or where listed values grow geometrically."""
+    if log is None:
+        axis = next(axis for axis in config.axes if axis.path == path)
+        grows = len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0
+        log = axis.scale == "log" if axis.values is None else bool(grows)
     edges = cell_edges(values, log)
-    return Axis(axis_label(config, path), path, log, (float(edges[0]), float(edges[-1]))), edges
+    return Axis(axis_label(config, path), path, log, (edges[0], edges[-1])), edges
 
 
 def axis_words(config: Config, path: str) -> dict[str, str]:
@@ -151,21 +144,17 @@ def axis_words(config: Config, path: str) -> dict[str, str]:
 
 def unit_of(config: Config, path: str) -> str:
     """The unit of what an axis varies; none of words."""
-    parameter = numeric_paths(config).get(path)
-    return "" if parameter is None else parameter.unit
+    return getattr(numeric_paths(config).get(path), "unit", "")
 
 
-def with_value(config: Config, path: str, value: Any) -> str:
-    """Words for a value of an axis: in milli, micro, nano where that is small."""
+def with_value(config: Config, path: str | None, value: Any) -> str:
+    """Words for a value of an axis, in milli, micro, nano where that is small; "" of no axis."""
+    if path is None:
+        return ""
     unit = unit_of(config, path)
     small = unit and not isinstance(value, str) and 1e-9 <= abs(value) < 1e-2
     text = EngFormatter(unit).format_data(value) if small else f"{_text(value)} {unit}".rstrip()
     return f"{path_words(config, path)} {text}"
-
-
-def _part_name(config: Config, path: str | None, value: Any) -> str:
-    """Words for the value that a panel or a line is of; "" where there is one alone."""
-    return "" if path is None else with_value(config, path, value)
 
 
 def _text(value: Any) -> str:
@@ -205,12 +194,12 @@ def colour_scale(values: Array, label: str, scale: str) -> Scale:
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return Scale(0.0, 1.0, label)
-    low, high = map(float, (finite.min(), finite.max()))
+    low, high = finite.min(), finite.max()
     if low == high or flat_remark(values):
         return Scale(low - 0.5 * abs(low) - 1e-12, high + 0.5 * abs(high) + 1e-12, label)
     if (scale == "log" or (scale == "auto" and low > 0.0 and high / low > 30.0)) and high > 0.0:
         # it begins at the smallest positive value
-        return Scale(float(finite[finite > 0.0].min()), high, label, log=True)
+        return Scale(finite[finite > 0.0].min(), high, label, log=True)
     return Scale(low, high, label)
 
 
@@ -225,15 +214,6 @@ def cell_edges(centres: Array, log: bool) -> Array:
     return np.exp(edges) if log else edges
 
 
-def is_log(config: Config, path: str, values: Array) -> bool:
-    """True if an axis is drawn logarithmically: as declared, or listed values that grow geometrically."""
-    axis = next(a for a in config.axes if a.path == path)
-    if axis.values is None:
-        return axis.scale == "log"
-    values = np.unique(values)
-    return bool(len(values) > 2 and values[0] > 0.0 and values[-1] / values[0] > 20.0)
-
-
 def _split(table: Any, path: str | None) -> list[tuple[Any, Any]]:
     """The value of each panel or line, and its part of a table or of rows; None and all where there is one alone."""
     if path is None:
@@ -246,15 +226,14 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Ser
     """The f_plus that conditions are drawn for: by panel, the median of the true bounds of its converged points, or of all
     if none did."""
     side = spec.x.split(".")[1]
+
     # most points of a refined study lie at its boundary: the median is that of the coarse grid
-    bounds = Column(
-        [f"{side}.converged", f"{side}.f_plus", "seed", *coarse_axes(points)],
-        lambda frame: frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame)),
-    )
-    converged = bounds._replace(of=lambda frame: bounds.of(frame).where(frame[f"{side}.converged"].astype(bool)))
+    def bounds(frame: DataFrame) -> Series:
+        return frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame))
+
     groups = Groups(rows, [] if spec.facet is None else [spec.facet])
-    medians = groups.medians(converged)
-    return medians.fillna(groups.medians(bounds)) if medians.isna().any() else medians
+    medians = groups.spread(lambda frame: bounds(frame).where(frame[f"{side}.converged"].astype(bool)))["median"]
+    return medians.fillna(groups.spread(bounds)["median"]) if medians.isna().any() else medians
 
 
 def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> tuple[list[Panel], str]:
@@ -270,13 +249,12 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         unseen = [path for path in paths if path not in keys]
         filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec.facet)]
         groups = Groups(filled, keys, paths)
-    table, converged = _map_table(groups, next(iter(filled)), spec.value), f"{side}.converged"
+    table, converged = _map_table(groups, spec.value), f"{side}.converged"
     bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
     errors, judged = {}, re.search(r"rmse|chatter|convergence_time$", spec.value) and converged in table
     if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
         # of a refined study those that were simulated
-        has_margin = f"{side}.margin_alpha" in next(iter(filled))
-        errors = dict(_split(worst_runs(simulated, spec.value, has_margin), spec.facet))
+        errors = dict(_split(worst_runs(simulated, spec.value), spec.facet))
     # what failed sets no colour
     table["shown"] = table["value"].where(~table["failed"])
     scale = colour_scale(table["shown"].to_numpy(float), value_label(spec.value), spec.scale)
@@ -290,29 +268,29 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         grid, failed = (plane[name].unstack() for name in plane)
         centres = (index.to_numpy(float) for index in (grid.columns, grid.index))
         (x, x_edges), (y, y_edges) = (axis_of(config, *axis) for axis in zip(axes, centres, strict=True))
-        parts: list[Part] = [Map(x_edges, y_edges, grid.to_numpy(), scale, failed.to_numpy() > 0.5, failure)]
+        parts = [Map(x_edges, y_edges, grid.to_numpy(), scale, failed.to_numpy() > 0.5, failure)]
         under = [flat_remark(part["shown"].to_numpy(float))]
         if errors and (best := best_gains(errors[value])):
             place = errors[value].index[best.index]
-            parts.append(mark(*place[::-1], "best", size=13.0))
+            parts += [mark(*place[::-1], "best", size=13.0)]
             under.append(f"best ★ {part['value'][place]:.2g} {find_metric(spec.value).unit}".rstrip())
         if bounds is not None:
-            bound, alpha_is_x = float(bounds[i]), spec.x.endswith(".alpha")
+            bound, alpha_is_x = bounds[i], spec.x.endswith(".alpha")
             alphas = (x if alpha_is_x else y).ends
             parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {bound:.3g} rad/s²")
-        title = "\n".join(filter(None, (_part_name(config, spec.facet, value), ",  ".join(filter(None, under)))))
+        title = "\n".join(filter(None, (with_value(config, spec.facet, value), ",  ".join(filter(None, under)))))
         drawn.append(Panel(x, y, parts, title))
     return drawn, f" and {path_words(config, spec.y)}{_over(config, groups.varied, spec)}."
 
 
-def _map_table(groups: Groups, sample: DataFrame, value: str) -> DataFrame:
+def _map_table(groups: Groups, value: str) -> DataFrame:
     """The places of a map: `value`, whether it is none that means something (`failed`: too few of its runs converged, or
-    one diverged), and the shares of runs that are `finite` and converged, of the columns that `sample` has."""
-    converged, column = f"{value.partition('.')[0]}.converged", _drawn_column(value)
-    table = groups.means({name: _number_column(name) for name in ("finite", converged) if name in sample})
+    one diverged), and the shares of runs that are `finite` and converged, of the columns that there are."""
+    converged, column = f"{value.partition('.')[0]}.converged", partial(drawn_values, value=value)
+    table = groups.means({name: itemgetter(name) for name in ("finite", converged) if name in groups.columns})
     # one number for each group: the median over what else varies, or the share that is true
-    middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.medians(column)
+    middle = groups.means({"middle": column})["middle"] if is_boolean(value) else groups.spread(column)["median"]
     # an average of the runs that did not diverge would hide that one did
     table["value"] = middle if value == "finite" else middle.where(table["finite"] == 1.0)
     table["failed"] = table["value"].isna()
@@ -337,33 +315,21 @@ def drawn_values(part: DataFrame, value: str) -> Series:
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
-def _drawn_column(value: str) -> Column:
-    return Column([value, "finite"], lambda frame: drawn_values(frame, value))
-
-
-def _number_column(name: str) -> Column:
-    return Column([name], lambda frame: frame[name].astype(float))
-
-
-def worst_runs(groups: Groups, value: str, has_margin: bool) -> DataFrame:
+def worst_runs(groups: Groups, value: str) -> DataFrame:
     """The worst run of each group: its `error`, the least `margin_alpha` of observers that have one, the share that
     `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
-    side, column = value.partition(".")[0], _drawn_column(value)
-    means = groups.means(
-        {
-            "converged": _number_column(f"{side}.converged"),
-            "mean": column,
-            "square": column._replace(of=lambda frame: column.of(frame) ** 2),
-        }
-    )
+    side, column = value.partition(".")[0], partial(drawn_values, value=value)
+    margin = f"{side}.margin_alpha"
+    columns: dict[str, Column] = {"mean": column, "square": lambda frame: column(frame) ** 2}
+    means = groups.means(columns | {"converged": itemgetter(f"{side}.converged")})
     scatter = 0.0
     if not groups.varied - set(groups.index.names):
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
         scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
-    if has_margin:
-        means["margin_alpha"] = groups.spread(_number_column(f"{side}.margin_alpha")).least
-    return means.assign(error=groups.spread(column).largest, scatter=scatter)
+    if margin in groups.columns:
+        means["margin_alpha"] = groups.spread(itemgetter(margin))["least"]
+    return means.assign(error=groups.spread(column)["largest"], scatter=scatter)
 
 
 def best_gains(runs: DataFrame) -> BestGains | None:
@@ -380,43 +346,44 @@ def best_gains(runs: DataFrame) -> BestGains | None:
 def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], str]:
     keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
     groups = Groups(rows, keys, config.axis_paths)
-    column = _drawn_column(spec.value)
+    column = partial(drawn_values, value=spec.value)
     spread = groups.spread(column)
-    table = groups.means({"middle": column}).assign(least=spread.least, largest=spread.largest)
-    if not is_boolean(spec.value):
-        table["middle"] = spread.median
+    table = groups.means({"mean": column}).join(spread)
     band, drawn = "", []
-    scale = colour_scale(np.concatenate([spread.least, spread.largest]), value_label(spec.value), spec.scale)
+    scale = colour_scale(spread.to_numpy(), value_label(spec.value), spec.scale)
+    middle = "mean" if is_boolean(spec.value) else "median"
     for facet, part in _split(table.reset_index(), spec.facet):
-        parts = list[Part]()
+        parts = []
         for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
-            x, name = line[spec.x], _part_name(config, spec.series, value)
+            x, name = line[spec.x], with_value(config, spec.series, value)
             if (line["rows"] > 1).any() and not is_boolean(spec.value):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
-            parts.append(Line(x, line["middle"], name, colour, marker="o", size=3.5))
+            parts.append(Line(x, line[middle], name, colour, marker="o", size=3.5))
         x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
-        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, _part_name(config, spec.facet, facet)))
+        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, with_value(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
 
 
 def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Panel], str]:
     """Points of lines that theory gives a slope for, with the lines fitted; a line without a law has its name."""
     panels = []
-    for facet in dict.fromkeys(spec.facet and law.where[spec.facet] for law in laws):
-        parts, members = list[Part](), [law for law in laws if spec.facet is None or law.where[spec.facet] == facet]
+    for facet in dict.fromkeys(law.where.get(spec.facet) for law in laws):
+        parts, members = [], [law for law in laws if law.where.get(spec.facet) == facet]
         for law, colour in zip(members, cycle(COLOURS), strict=False):
             lead = "".join(f"{_text(value)}: " for value in law.series.values())
-            name = lead + ("no law" if law.fit is None else slope_text(law.fit))
-            y = np.where(law.y_values > 0.0, law.y_values, np.nan)
-            ends = [] if law.fit is None else law.x_values[[law.fit.first, law.fit.last]]
+            slope, x, y = "no law", [], []
+            if law.fit is not None:
+                slope, x = slope_text(law.fit), law.x_values[[law.fit.first, law.fit.last]]
+                y = law.fit(x)
+            errors = np.where(law.y_values > 0.0, law.y_values, np.nan)
             parts += [
-                Line(law.x_values, y, colour=colour, width=0.0, marker="o", size=3.5),
-                Line(ends, ends if law.fit is None else law.fit(ends), name, colour),
+                Line(law.x_values, errors, colour=colour, width=0.0, marker="o", size=3.5),
+                Line(x, y, lead + slope, colour),
             ]
         x, _ = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
         panels.append(
-            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, _part_name(config, spec.facet, facet))
+            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, with_value(config, spec.facet, facet))
         )
     seeds = config.sweep.seeds
     return panels, (

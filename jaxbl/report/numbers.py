@@ -1,6 +1,6 @@
 """Numbers that were found in a log: as key figures, as rows of a table, and as files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 import tomli_w
 
-from jaxbl.files import to_jsonable, write_json
+from jaxbl.files import to_jsonable
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.quantity import QUANTITY_COLUMNS, Quantity
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -23,10 +23,13 @@ def number_figures(numbers: Mapping[str, Quantity]) -> list[KeyFigure]:
     return [KeyFigure(str(numbers[path]), path) for path in first]
 
 
-def number_table(heading: str, numbers: Mapping[str, Quantity]) -> ResultTable:
-    """Table of numbers by path, without columns that would be empty."""
-    rows = [[path, *number.row()] for path, number in numbers.items()]
-    table = pd.DataFrame(rows, columns=["path", *QUANTITY_COLUMNS]).dropna(axis=1, how="all")
+def number_table(
+    heading: str, numbers: Mapping[str, Quantity], profiles: Mapping[str, Sequence[float] | None] = {}
+) -> ResultTable:
+    """Table of numbers by path, with intervals by profile likelihood, and without columns that would be empty."""
+    rows = [[path, *number.row(), *(profiles.get(path) or (None, None))] for path, number in numbers.items()]
+    columns = ["path", *QUANTITY_COLUMNS, "by profile from", "to"]
+    table = pd.DataFrame(rows, columns=columns).dropna(axis=1, how="all")
     return ResultTable(heading, list(table), to_jsonable(table.to_numpy()))
 
 
@@ -39,14 +42,12 @@ def lead_with_doubt(result: Result) -> Result:
     return replace(result, verdict="doubtful", headline=doubts[0].removeprefix(DOUBT), remarks=remarks)
 
 
-def write_fit(result: Any, folder: Path, name: str, model: str = "") -> str:
-    """Write `name.json`, `model.toml` and `trace.parquet` of a fit to a log into a folder that exists. Returns the model's
-    TOML."""
+def write(result: Any, folder: Path, model: str = "") -> str:
+    """Write `model.toml` and `trace.parquet` of a fit to a log into a folder that exists. Returns the model's TOML."""
     result.trace.to_parquet(folder / "trace.parquet", index=False)
     # that of a transmission alone is given
     model = model or format_model(result, folder / "trace.parquet")
     (folder / "model.toml").write_text(model, encoding="utf-8")
-    write_json(folder / f"{name}.json", result.summary)
     return model
 
 

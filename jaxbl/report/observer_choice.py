@@ -21,21 +21,7 @@ from jaxbl.lines import Lines
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .maps import axis_label, with_value
-from .panels import (
-    SIDE_COLOURS,
-    Axis,
-    Figure,
-    Line,
-    Map,
-    Panel,
-    Part,
-    Scale,
-    Span,
-    arrange,
-    intervals,
-    name_rows,
-    tick_text,
-)
+from .panels import SIDE_COLOURS, Axis, Figure, Line, Map, Panel, Scale, Span, arrange, intervals, name_rows, tick_text
 from .tune import error_label, for_title, write_gains
 
 
@@ -58,7 +44,7 @@ def _ratios(summary: JsonObject) -> Figure:
         ratio, low, high = compared.to_numpy()
         texts = ["best" if i == 0 else _ratio(kinds[kind]) for i, kind in enumerate(compared)]
         texts += ["diverged, or too slow"] * len(lost)
-        parts: list[Part] = [
+        parts = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
             *intervals(range(len(high)), low, ratio, high, colour=SIDE_COLOURS[side]),
             Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
@@ -79,7 +65,9 @@ def _lost_kinds(kinds: JsonObject) -> list[str]:
 
 
 def _ratio(result: JsonObject) -> str:
-    """The ratio, with its interval if runs differ; more digits where it would read as one."""
+    """The ratio, with its interval if runs differ; more digits where it would read as one; a dash of none."""
+    if result["ratio"] is None:
+        return "–"
     ratio, low, high = (f"{result[key]:.{3 if abs(result[key] - 1.0) > 0.005 else 6}g}" for key in _RATIO)
     return ratio if runs_are_equal(result) else f"{ratio} ({low} to {high})"
 
@@ -87,7 +75,7 @@ def _ratio(result: JsonObject) -> str:
 def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, list[Any]]:
     """Values of the axes that have several, in their order; of axes that advance together, those of the side's own, or of
     the first."""
-    together: dict[str, list[str]] = {}
+    together = {}
     assert config.tune is not None
     for axis in config.tune.axes:
         together.setdefault(axis.zip or axis.path, []).append(axis.path)
@@ -98,7 +86,7 @@ def _varied_values(config: Config, summary: JsonObject, side: str) -> dict[str, 
 
 def short_names(kinds: Sequence[str]) -> dict[str, str]:
     """Few letters for each kind: the initials of its words, with a number in full, and a stroke where two are the same."""
-    names: dict[str, str] = {}
+    names = {}
     for kind in kinds:
         name = "".join(word if word.isdigit() else word[0].upper() for word in kind.split("_"))
         while name in names.values():
@@ -158,8 +146,9 @@ def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
 
 
 def write(choice: ObserverChoice, folder: Path) -> str:
-    """Write `tuning.json`, and of a single point `gains.toml`. Returns the study's TOML."""
-    return write_gains(choice, folder, observer_toml(choice.summary))
+    """Write `gains.toml` of a single point. Returns the study's TOML."""
+    gains = observer_toml(choice.summary)
+    return choice.config.to_toml() if gains is None else write_gains(choice, folder, gains)
 
 
 def describe(choice: ObserverChoice) -> Result:
@@ -198,7 +187,7 @@ def observer_toml(summary: JsonObject) -> str | None:
     ]
     gains = {side: dict(result["gains"]) for side, result in sides.items()}
     constants = {side: gains[side].pop(TIME_CONSTANT) for side in sides if TIME_CONSTANT in gains[side]}
-    data: JsonObject = {"observer": {"kind": kind, **gains}}
+    data = {"observer": {"kind": kind, **gains}}
     if constants:
         data["equivalent_control"] = {"time_constant": constants.get("motor")}
         if len(constants) > 1:
@@ -258,9 +247,8 @@ def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
         rows = []
         for point in points:
             result = point["sides"][side]
-            ratios = ["–" if (numbers := result["kinds"][kind])["ratio"] is None else _ratio(numbers) for kind in kinds]
-            values, tied = (point["values"][path] for path in axes), ", ".join(result["not_told_apart"])
-            rows.append([*values, result["best"] or "none", tied, *ratios])
+            values, ratios = (point["values"][path] for path in axes), (_ratio(result["kinds"][kind]) for kind in kinds)
+            rows.append([*values, result["best"] or "none", ", ".join(result["not_told_apart"]), *ratios])
         columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
         tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
     return tables

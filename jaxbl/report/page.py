@@ -47,7 +47,7 @@ def format_page(result: Result, pictures: Sequence[tuple[str, Picture]], config:
     style, script = "\n".join(texts[:2]), "\n".join(texts[2:])
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{allowed}'"
-    first, *more = (_figure(*named) for named in pictures) if pictures else ("",)
+    first, *more = [_figure(*named) for named in pictures] or [""]
     # a short table of what was found stands before what is said of it
     above = [table for table in result.tables[:1] if len(table.rows) <= _SHORT]
     parts = [_card(result, first), *map(_table, above), _list(result.remarks)]

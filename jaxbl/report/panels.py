@@ -206,9 +206,8 @@ def join(axis: Any, parts: Iterable[slice], *signals: Any) -> list[Array]:
     return columns
 
 
-def draw_signals(time: Any, segments: Iterable[slice], signals: Iterable[tuple[Any, str, str, str]]) -> list[Panel]:
+def draw_signals(time: Any, segments: Iterable[slice], signals: Sequence[tuple[Any, str, str, str]]) -> list[Panel]:
     """A panel over time for each signal: its values, label, unit and colour; lines break between segments."""
-    signals = list(signals)
     time, *joined = join(time, segments, *(values for values, *_ in signals))
     return [
         Panel(TIME, Axis(f"{label}\n({unit})"), [Line(time, values, colour=colour, width=0.9)])
@@ -289,7 +288,7 @@ def limits(*values: Any, inside: Sequence[float] = ()) -> Pair | None:
     ends = [*np.quantile(finite, [0.001, 0.999]), *inside]
     low, high = min(ends), max(ends)
     margin = 0.12 * (high - low) or 1e-12 + 0.1 * abs(high)
-    return float(low - margin), float(high + margin)
+    return low - margin, high + margin
 
 
 def round_ticks(low: float, high: float) -> list[float]:
@@ -335,7 +334,7 @@ def literal(name: str) -> str:
     return shorten(escape_unprintable(name), _LONGEST_NAME)
 
 
-_LARGEST = float(np.finfo(np.float32).max)
+_LARGEST = np.finfo(np.float32).max
 
 
 def pack_numbers(values: Any) -> str:

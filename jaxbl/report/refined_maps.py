@@ -25,7 +25,7 @@ class Filling:
     def __init__(self, points: Points, frame: DataFrame, x: str, y: str):
         assert points.refinement is not None
         # values of each axis, and how many of them a coarse cell has
-        self._axes: dict[str, tuple[Array, int]] = {}
+        self._axes = {}
         for path in (y, x):
             refined = path in points.refinement.paths
             values = points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float))
@@ -43,7 +43,12 @@ class Filling:
 
     def fill(self, table: DataFrame) -> DataFrame:
         """A table over (y, x) on the whole plane: rows of the nearest places, NaN where there is none."""
-        plane = pd.MultiIndex.from_product([_drawn_values(*axis) for axis in self._axes.values()], names=[*self._axes])
+        # all values of an axis, or every 2nd, 4th, ...
+        drawn = [
+            values[:: min(1 << ((len(values) - 1) // _MOST_SHOWN).bit_length(), cell)]
+            for values, cell in self._axes.values()
+        ]
+        plane = pd.MultiIndex.from_product(drawn, names=[*self._axes])
         nearest = self._nearest(table.index.to_frame(), plane.to_frame())
         return table.reset_index(drop=True).reindex(nearest).set_axis(plane)
 
@@ -60,27 +65,3 @@ class Filling:
             there = nearest < len(part)
             parts.append(part.iloc[nearest[there]].assign(**vertices[there].to_dict("list")))
         return pd.concat(parts, ignore_index=True)
-
-
-def _drawn_values(values: Array, cell: int) -> Array:
-    """Values of an axis that a figure shows: all, or every 2nd, 4th, ..."""
-    step = 1
-    while len(values) > _MOST_SHOWN * step and step < cell:
-        step *= 2
-    return values[::step]
-
-
-def coarse_axes(points: Points) -> dict[str, Array]:
-    """Values of the coarse grid along the refined axes, by path; none of a study that is not refined."""
-    if points.refinement is None:
-        return {}
-    stride = 1 << points.refinement.grid.depth
-    return {path: points.axis_values(path)[::stride] for path in points.refinement.paths}
-
-
-def on_coarse_values(points: Points, frame: DataFrame, drawn: list[str]) -> DataFrame:
-    """The rows of a refined study whose values are on the coarse grid along all axes but those drawn."""
-    for path, values in coarse_axes(points).items():
-        if path not in drawn:
-            frame = frame.loc[np.isin(frame[path], values)]
-    return frame

@@ -4,14 +4,18 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from html import escape
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxbl.errors import InputError
-from jaxbl.files import ResultFolder, Subject, lock_folder, log_subject, to_path
+from jaxbl.files import ResultFolder, Subject, lock_folder, log_subject, to_jsonable, to_path, write_json
 from jaxbl.fused import SCAN_MESSAGE
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import format_duration
+from jaxbl.records import Inspection
 from jaxbl.result import Result
+from jaxbl.sweeps.compare import Comparison
 from jaxbl.sweeps.store import study_subject
 from jaxbl.validation import suggest_word
 
@@ -39,28 +43,26 @@ class _Kind(NamedTuple):
 
     Attributes:
         report: module with `describe`, which says what was found (of logs by the summary), `draw`, which draws the figures
-            (the first is the one beside the answer), and `write`, which writes the files beside the page into a folder and
-            returns the study or model that the page shows, as TOML.
-        file: what was found, as data; names the result in the manifest of its folder.
+            (the first is the one beside the answer), and `write`, which writes further files beside the page into a folder
+            and returns the study or model that the page shows, as TOML.
+        file: what was found, as data, or the page where that is all; names the result in the manifest of its folder.
         subject: what the result is about.
+        summary: what the file holds.
     """
 
     report: Any
     file: str = PAGE
     subject: Callable[[Any], Subject] = lambda result: study_subject(result.config)
+    summary: Callable[[Any], JsonObject] = attrgetter("summary")
 
 
 def _log(result: Any) -> Subject:
     return log_subject(Path(result.summary["file"]))
 
 
-def _find_result_type(report: Any) -> type:
-    """Find the type of the results that a module reports on: of the argument of its `draw`."""
-    return next(iter(report.draw.__annotations__.values()))
-
-
+# by the type of the result, which is the argument of its module's `draw`
 _KINDS = {
-    _find_result_type(kind.report): kind
+    next(iter(kind.report.draw.__annotations__.values())): kind
     for kind in (
         _Kind(simulate, "summary.json"),
         _Kind(sweep),
@@ -68,8 +70,8 @@ _KINDS = {
         _Kind(observer_choice, "tuning.json"),
         _Kind(loop_gains, "tuning.json"),
         _Kind(verify),
-        _Kind(compare, "comparison.json", lambda _: Subject("comparison")),
-        _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path)),
+        _Kind(compare, "comparison.json", lambda _: Subject("comparison"), Comparison.to_dict),
+        _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path), Inspection.to_dict),
         _Kind(identify, "identification.json", _log),
         _Kind(element, "identification.json", _log),
         _Kind(diagnose, "diagnosis.json", _log),
@@ -149,6 +151,8 @@ def write_report(result: Any, folder: str | Path | ResultFolder, described: Resu
         # without details, of which one is how long compiling took: the same results have the same manifest
         card = {"title": described.title, "sentences": replace(described, details=()).sentences}
         draft = stack.enter_context(folder.write_files(kind.file, identity=identity, **card))
+        if kind.file != PAGE:
+            write_json(draft / kind.file, to_jsonable(kind.summary(result)))
         config = kind.report.write(result, draft)
         write_page(draft, described, kind.report.draw(result), config)
     return described

@@ -3,33 +3,20 @@
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from pandas import DataFrame
 
-from jaxbl.files import write_json
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
 from .error_plane import error_plane
 from .gain_plane import conditions_line, draw_gain_plane
-from .panels import (
-    SIDE_COLOURS,
-    SIDES,
-    TIME,
-    VERMILION,
-    ZERO,
-    Axis,
-    Figure,
-    Line,
-    Panel,
-)
+from .panels import SIDE_COLOURS, SIDES, TIME, VERMILION, ZERO, Axis, Figure, Line, Panel
 
 
 def write(trial: Trial, folder: Path) -> str:
-    """Write trace and summary of a run. Returns the study's TOML."""
-    write_json(folder / "summary.json", trial.summary)
+    """Write the trace of a run. Returns the study's TOML."""
     trial.trace.to_parquet(folder / "trace.parquet", index=False)
     return trial.config.to_toml()
 
@@ -46,14 +33,14 @@ def describe(trial: Trial) -> Result:
     elif metrics["finite"]:
         times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
-    quantities = [(side, *quantity) for side in sides for quantity in (("velocity", "rad/s"), ("torque", "N m"))]
+    quantities = [*itertools.product(sides, ("velocity", "torque"))]
     if trial.config.controller is not None:
-        quantities.append((trial.config.controller.side, "following", "rad"))
+        quantities += [(trial.config.controller.side, "following")]
     figures = []
-    for side, quantity, unit in quantities:
+    for side, quantity in quantities:
         error, largest = metrics[f"{side}.{quantity}_rmse"], limits.velocity_tolerance / drive.ratio(side)
         bound = f"; the largest may be {largest:.3g}" if quantity == "velocity" else ""
-        text = "diverges" if error is None else f"{error:.3g} {unit}"
+        text = "diverges" if error is None else f"{error:.3g} {SIDE_METRICS[f'{quantity}_rmse'].unit}"
         figures.append(KeyFigure(text, f"{side}: {quantity} error, rms{bound}"))
     rows = [
         [name, *(metrics.get(f"{side}.{name}") for side in sides), metric.unit, metric.doc]
@@ -114,7 +101,7 @@ def _compare(
 
 
 def _hysteresis(trace: DataFrame) -> Figure:
-    last: Any = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
+    last = trace[trace["t"] > 0.5 * trace["t"].iloc[-1]]
     loops = [
         Line(last["z"], last[f"{side}.torque_estimate"], f"by the {side} observer", SIDE_COLOURS[side], 1.6, opacity=0.75)
         for side in SIDES

@@ -4,16 +4,13 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import pandas as pd
-
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
-from jaxbl.gains.best_gains import NEARLY_AS_GOOD, BestGains
-from jaxbl.lines import Lines, percent
+from jaxbl.gains.best_gains import NEARLY_AS_GOOD
+from jaxbl.lines import percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
 from jaxbl.sweeps.points import Points
@@ -33,44 +30,54 @@ def write(result: StudyResult, folder: Path) -> str:
 
 def describe(result: StudyResult) -> Result:
     """Say where the observers work, and which gains are best, with tables of axes that matter and of laws."""
-    survey, laws = _Survey(result), laws_of(result)
-    tables = [_law_table(laws)] * bool(laws)
-    tables += (_importance_table(side, ranked) for side, ranked in survey.importance.items())
-    answer = answer_sweep(result, survey)
+    answer, laws = answer_sweep(result), laws_of(result)
+    if not laws:
+        return answer
     # the table says which
     agreeing = (
         f"Accuracy laws: {sum(law.agrees for law in laws)} of {len(laws)} have a slope within {AGREEMENT:g} of theory."
     )
-    return replace(answer, remarks=[*answer.remarks, *[agreeing] * bool(laws)], tables=tables)
+    return replace(answer, remarks=[*answer.remarks, agreeing], tables=[_law_table(laws), *answer.tables])
 
 
-def answer_sweep(result: StudyResult, survey: "_Survey | None" = None) -> Result:
-    """Say where the observers work, and which gains are best."""
-    config, survey, remarks = result.config, survey or _Survey(result), []
-    finished = result.is_finished(survey.runs)
+def answer_sweep(result: StudyResult) -> Result:
+    """Say where the observers work, and which gains are best, with tables of axes that matter."""
+    config, survey, remarks = result.config, _Survey(result), []
+    finished, figures = result.is_finished(survey.runs), []
     if not finished:
         remarks.append(f"The study is not finished: it has {result.runs} runs so far. Go on with 'jaxbl sweep'.")
     if survey.diverged:
         remarks.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
-    remarks += (line for side, (best, _) in survey.best.items() for line in _best_lines(side, best))
+    for side, (best, runs) in survey.best.items():
+        if best is None:
+            remarks.append(f"{side}: no gains converged in all runs with α above f⁺.")
+            continue
+        remarks += [
+            f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
+            for gain, way in best.ends.items()
+        ]
+        row = runs.reset_index().iloc[best.index]
+        place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
+        as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
+        figures += [
+            KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})"),
+            KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}"),
+        ]
     works = survey.diverged < survey.runs and all(survey.converged.values())
     works = works and all(best is not None for best, _ in survey.best.values())
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
     verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
-    figures = [figure for side, best in survey.best.items() for figure in _best_figures(side, *best)]
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
-    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes)
-
-
-def _best_figures(side: str, best: BestGains | None, runs: pd.DataFrame) -> Iterator[KeyFigure]:
-    """The best gains of a side with their error, and how far they may change."""
-    if best is not None:
-        row = runs.reset_index().iloc[best.index]
-        place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
-        yield KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})")
-        as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
-        yield KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}")
+    tables = [
+        ResultTable(
+            f"{side}: which axis matters for the velocity error",
+            ["axis", "by itself", "with others"],
+            [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked],
+        )
+        for side, ranked in survey.importance.items()
+    ]
+    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes, tables)
 
 
 def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
@@ -78,11 +85,6 @@ def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
     share, way = (axis.alone, "") if axis.total is None else (axis.total, " and what it does together with others")
     text = f"of the {side} observer's velocity error goes with {axis.path}{way} (share of the variance of its logarithm)"
     return KeyFigure(_share(share), text)
-
-
-def _importance_table(side: str, ranked: list[AxisImportance]) -> ResultTable:
-    rows = [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked]
-    return ResultTable(f"{side}: which axis matters for the velocity error", ["axis", "by itself", "with others"], rows)
 
 
 def _share(share: tuple[float, float] | None) -> str:
@@ -104,57 +106,45 @@ class _Survey:
         paths = config.axis_paths
         names = "converged", "velocity_rmse", "margin_alpha"
         metrics = [column for column in result.columns if column.rpartition(".")[2] in names]
-        self.sides = [side for side in config.sides if f"{side}.converged" in metrics]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(config)
         self.runs = self.even = self.diverged = 0
-        self.converged = dict.fromkeys(self.sides, 0)
-        self.best: dict[str, tuple[BestGains | None, pd.DataFrame]] = {}
+        self.converged = {side: 0 for side in config.sides if f"{side}.converged" in metrics}
+        self.best, self.importance = {}, {}
         for frame in result.batches([*paths, "seed", "finite", *metrics]):
             even = frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
-            self.diverged += int((~frame["finite"].astype(bool)).sum())
-            for side in self.sides:
-                self.converged[side] += int(even[f"{side}.converged"].sum())
-        self.importance: dict[str, list[AxisImportance]] = {}
+            self.diverged += (~frame["finite"].astype(bool)).sum()
+            for side in self.converged:
+                self.converged[side] += even[f"{side}.converged"].sum()
         varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
         for side in config.sides:
             error, gains = f"{side}.velocity_rmse", [path for path in varied if path.startswith(f"observer.{side}.")]
             if error in metrics and (ranked := rank_axes(result, error)):
                 self.importance[side] = ranked
-            if error in metrics and side in self.sides and gains:
+            if error in metrics and side in self.converged and gains:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
                 groups = Groups(Rows(result, columns), gains, paths)
-                runs = worst_runs(groups, error, f"{side}.margin_alpha" in metrics)
+                runs = worst_runs(groups, error)
                 self.best[side] = best_gains(runs), runs
 
 
 def _headline(result: StudyResult, survey: _Survey) -> str:
     """Say in how many runs the observers converge."""
-    count, among = f"{survey.runs} runs", ""
+    runs, among = f"{survey.runs} runs", ""
     if result.config.sweep.refine is not None:
         points = len(Points(result.config))
         simulated = survey.runs // result.config.sweep.seeds
-        count = f"{count} at {simulated} of {points} grid points ({percent(simulated / points)})"
+        runs = f"{runs} at {simulated} of {points} grid points ({percent(simulated / points)})"
         among = " on the coarse grid"
     even = survey.even or math.nan
     works = {side: ", with the best gains in all" for side, (best, _) in survey.best.items() if best is not None}
     shares = [
-        f"the {side} observer converges in {100 * survey.converged[side] / even:.1f} %{among}{works.get(side, '')}"
-        for side in survey.sides
+        f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
+        for side, count in survey.converged.items()
     ]
-    return f"{count}: {'; '.join(shares)}." if shares else f"{count}."
-
-
-def _best_lines(side: str, best: BestGains | None) -> Lines:
-    """Say what is wrong with the best gains of a side."""
-    if best is None:
-        return [f"{side}: no gains converged in all runs with α above f⁺."]
-    return [
-        f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
-        for gain, way in best.ends.items()
-    ]
+    return f"{runs}: {'; '.join(shares)}." if shares else f"{runs}."
 
 
 def _explain_ends(law: Law) -> str:

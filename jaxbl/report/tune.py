@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxbl.files import write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
@@ -19,16 +18,7 @@ from .certificate import certificate_lines, certificate_tables, is_refuted, writ
 from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usual_rule_curve
 from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
-from .panels import (
-    MARKERS,
-    Figure,
-    Map,
-    Panel,
-    Part,
-    literal,
-    mark,
-    with_unit,
-)
+from .panels import MARKERS, Figure, Map, Panel, literal, mark, with_unit
 
 
 def draw(tuning: Tuning) -> list[Figure]:
@@ -50,14 +40,14 @@ def _map(tuning: Tuning, side: str) -> Figure:
     grid, failed = error.to_numpy(float), ~(feasible.to_numpy() >= 0.5)
     values = np.where(failed, np.nan, grid)
     x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
-    alphas, lambdas = ((float(edges[0]), float(edges[-1])) for edges in (x, y))
+    alphas, lambdas = ((edges[0], edges[-1]) for edges in (x, y))
     cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
-    parts: list[Part] = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
+    parts = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
     # on the study's own excitation
     compared = [row for row in summary["named"] if row["side"] == side and row["name"] != "tuned"]
     for row, marker in zip(compared, cycle(MARKERS), strict=False):
-        parts.append(mark(row["alpha"], row["lambda"], literal(row["name"]), marker, 8.0))
-    parts.append(mark(gains["alpha"], gains["lambda"], "tuned"))
+        parts += [mark(row["alpha"], row["lambda"], literal(row["name"]), marker, 8.0)]
+    parts += [mark(gains["alpha"], gains["lambda"], "tuned")]
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     if flat := flat_remark(values):
         title = f"{title}\n{flat}"
@@ -102,16 +92,14 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
 
 
 def write(tuning: Tuning, folder: Path) -> str:
-    """Write `gains.toml`, `tuning.json` and certificates. Returns the study's TOML."""
+    """Write `gains.toml` and certificates. Returns the study's TOML."""
     write_certificates(tuning.summary, folder)
     return write_gains(tuning, folder, gains_toml(tuning.summary))
 
 
-def write_gains(tuning: Any, folder: Path, gains: str | None) -> str:
-    """Write what `jaxbl tune` found, and gains as TOML, if there are any. Returns the study's TOML."""
-    if gains is not None:
-        (folder / "gains.toml").write_text(gains, encoding="utf-8")
-    write_json(folder / "tuning.json", tuning.summary, allow_nan=False)
+def write_gains(tuning: Any, folder: Path, gains: str) -> str:
+    """Write gains as TOML. Returns the study's TOML."""
+    (folder / "gains.toml").write_text(gains, encoding="utf-8")
     return tuning.config.to_toml()
 
 
@@ -139,11 +127,14 @@ def describe(tuning: Tuning) -> Result:
     if is_refuted(summary):
         verdict, headline = "failed", "The search found an error above what was proven."
         remarks = [*certified, *doubts, *_reasons(summary)]
-    details = [line for line in summary["remarks"] if line not in doubts]
+    details, holdout = [line for line in summary["remarks"] if line not in doubts], summary["holdout"]
+    where = f"On the held-out excitation ({holdout['excitation']['kind']})"
+    if holdout["same_excitation"]:
+        where = "On the study's excitation with other noise"
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
-        _comparison_table(f"{_where(summary).capitalize()}, worst and median of all runs", summary["holdout"]["rows"]),
+        _comparison_table(f"{where}, worst and median of all runs", holdout["rows"]),
     ]
     title = tuning.config.title or "Gains"
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
@@ -185,10 +176,12 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
 
 def gains_toml(summary: JsonObject) -> str:
     """The chosen gains as TOML that a study can `include`; comments say what they were chosen for."""
-    margins = summary["margins"]
+    margins, (first, last) = summary["margins"], summary["seeds"]
+    seeds, drives = last - first + 1, len(summary["scenarios"])
     lines = [
         f"# Gains chosen by 'jaxbl tune'{for_title(summary)}",
-        f"# Objective: {summary['objective_metric']}; {_runs_behind(summary)}.",
+        f"# Objective: {summary['objective_metric']}; {seeds} noise seed{'s' * (seeds > 1)} and {drives} "
+        f"drive{'s' * (drives > 1)}.",
         f"# Margins asked for: alpha / f+ {margins['alpha']:g}, lambda over the least of the exact condition "
         f"{margins['exact']:g}.",
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.',
@@ -212,19 +205,6 @@ def for_title(summary: JsonObject) -> str:
     """Say what gains were chosen for, in one line."""
     title = " ".join(summary["title"].split())
     return f" for: {title}" if title else ""
-
-
-def _runs_behind(summary: JsonObject) -> str:
-    first, last = summary["seeds"]
-    seeds, drives = last - first + 1, len(summary["scenarios"])
-    return f"{seeds} noise seed{'s' * (seeds > 1)} and {drives} drive{'s' * (drives > 1)}"
-
-
-def _where(summary: JsonObject) -> str:
-    """Which runs were held out."""
-    runs = summary["holdout"]
-    other = f"on the held-out excitation ({runs['excitation']['kind']})"
-    return "on the study's excitation with other noise" if runs["same_excitation"] else other
 
 
 def _reasons(summary: JsonObject) -> Lines:

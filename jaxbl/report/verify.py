@@ -26,20 +26,7 @@ _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "samp
 
 
 def draw(verdict: Verdict) -> list[Figure]:
-    """The atlas; the runs of the drive are for `jaxbl explore`."""
-    return [_atlas(verdict)]
-
-
-def _mark_gains(verdict: Verdict) -> list[Line]:
-    """Marks of the usual pair and of the study's marks."""
-    marks = [_USUAL, *(gains for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None)]
-    return [
-        mark(gains["alpha_ratio"], gains["lambda_ratio"], literal(gains["name"]), marker, 12.0)
-        for gains, marker in zip(marks, itertools.cycle(("*", *MARKERS)), strict=False)
-    ]
-
-
-def _atlas(verdict: Verdict) -> Figure:
+    """The atlas with the usual pair and the study's marks; the runs of the drive are for `jaxbl explore`."""
     plane = verdict.error_map
     scale = Scale(0.05, 20.0, "ratio ρ of successive velocity peaks, simulated", True, "PuOr_r")
     ranges = {"α / f⁺": plane.alpha, "λ / √f⁺": plane.lambda_}
@@ -47,14 +34,19 @@ def _atlas(verdict: Verdict) -> Figure:
     curves = condition_curves(list_conditions(verdict.config), 1.0, (plane.alpha[0], plane.alpha[-1]))
     step = max(len(plane.alpha) // 24, 1)
     boundary = Line(plane.alpha[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
-    parts = [Map(*edges, plane.ratio, scale), *curves, boundary, *_mark_gains(verdict)]
+    marks = [_USUAL, *(gains for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None)]
+    marks = [
+        mark(gains["alpha_ratio"], gains["lambda_ratio"], literal(gains["name"]), marker, 12.0)
+        for gains, marker in zip(marks, itertools.cycle(("*", *MARKERS)), strict=False)
+    ]
+    parts = [Map(*edges, plane.ratio, scale), *curves, boundary, *marks]
     title = "Error system under its worst disturbance: below the boundary it grows"
     caption = (
         f"Simulated ratio of successive velocity peaks over {plane.ratio.size} cells; every condition demands a λ above its "
         "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
-    axes = (Axis(label, log=True, ends=(float(values[0]), float(values[-1]))) for label, values in ranges.items())
-    return Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
+    axes = (Axis(label, log=True, ends=(values[0], values[-1])) for label, values in ranges.items())
+    return [Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)]
 
 
 def write(verdict: Verdict, folder: Path) -> str:
@@ -111,7 +103,7 @@ def _judge_own_gains(verdict: Verdict) -> JsonObject:
     for side in sides_with_gain_axes(verdict.config):
         gains, bounds = getattr(verdict.config.observer, side), verdict.levels["drive"][f"{side}.f_plus"]
         if gains.lambda_ is not None and gains.alpha is not None:
-            judged[side] = judge_gains(gains.lambda_, gains.alpha, float(bounds[np.isfinite(bounds)].max()))
+            judged[side] = judge_gains(gains.lambda_, gains.alpha, bounds[np.isfinite(bounds)].max())
     return judged
 
 

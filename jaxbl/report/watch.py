@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import tomli_w
 
-from jaxbl.files import catch_write_errors, write_json
+from jaxbl.files import catch_write_errors
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
 from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
@@ -14,19 +14,17 @@ from jaxbl.records.signal_quality import find_runs
 from jaxbl.result import KeyFigure, Result
 
 from .numbers import lead_with_doubt
-from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Part, Span, limits
+from .panels import SIDE_COLOURS, SIDES, VERMILION, Axis, Band, Figure, Line, Panel, Span, limits
 
 VALUES = "watch.csv"
-SUMMARY = "watch.json"
 LABELS = {
     "half_gap": "half gap", "stiffness": "stiffness", "coulomb": "Coulomb friction", "viscous": "viscous friction",
 }  # fmt: skip
 
 
 def write(watch: Watch, folder: Path) -> str:
-    """Write `watch.csv` and `watch.json`. Returns the study's TOML."""
+    """Write `watch.csv`. Returns the study's TOML."""
     watch.values.to_csv(folder / VALUES, index=False)
-    write_json(folder / SUMMARY, watch.summary)
     return tomli_w.dumps(watch.task.config.to_dict())
 
 
@@ -96,39 +94,39 @@ def open_values(folder: Path, task: WatchTask) -> Callable[[JsonObject], None]:
 
 def draw(watch: Watch) -> list[Figure]:
     """Gap, stiffness and friction over time."""
-    values, task, limit = watch.values, watch.task, watch.task.alarm_gap
-    law = [name for name in ("half_gap", "stiffness") if f"motor.{name}" in values]
-    # friction of each side acts on a shaft of its own
-    friction = [(name, (side,)) for name in ("coulomb", "viscous") for side in SIDES]
-    if not len(values):
+    if not len(watch.values):
         return []
-    time, panels = values["t"].to_numpy(float), []
-    half = 0.5 * task.interval
-    x = Axis("time (s)", ends=(time[0] - half, time[-1] + half))
-    for name, sides in [*((name, SIDES) for name in law), *friction]:
-        parts, curves, inside = list[Part](), [], []
-        if name == "half_gap" and limit is not None:
-            inside = [limit]
-            starts, ends = find_runs(values["alarm"].to_numpy(bool))
-            parts += [
-                Span(start, end, "alarm", VERMILION, opacity=0.12)
-                for start, end in zip(time[starts] - half, time[ends - 1] + half, strict=True)
-            ]
-            parts.append(Span(limit, limit, "limit", along="y", width=1.2))
-        for side in sides:
-            middle, error = (values[f"{side}.{name}{kind}"].astype(float) for kind in ("", "_error"))
-            low, high = middle - INTERVAL * error, middle + INTERVAL * error
-            who = f"by the {side}'s observer"
-            parts += [Band(time, low, high, "", SIDE_COLOURS[side]), Line(time, middle, who, SIDE_COLOURS[side])]
-            # what is hardly determined would set the scale of all else
-            sure = error <= 3.0 * error.median()
-            curves += [middle[sure], low[sure], high[sure]]
-        lead = f"{sides[0]} " if len(sides) == 1 else ""
-        y = Axis(f"{LABELS[name]}\n{lead}({task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))
-        panels.append(Panel(x, y, parts))
+    task = watch.task
     caption = f"Numbers of the last {task.window:g} s by both observers, with 95 % intervals."
-    if limit is not None:
+    if task.alarm_gap is not None:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
-    # gap and stiffness are seen at once, friction below
-    parted = {"watch": panels[: len(law)], "watch_friction": panels[len(law) :]}
-    return [Figure(name, part, caption, height=1.5) for name, part in parted.items() if part]
+    # gap and stiffness are seen at once; friction, below, acts on a shaft of its own on each side
+    law = [_panel(watch, name, *SIDES) for name in ("half_gap", "stiffness") if f"motor.{name}" in watch.values]
+    friction = [_panel(watch, name, side) for name in ("coulomb", "viscous") for side in SIDES]
+    figures = ("watch", law), ("watch_friction", friction)
+    return [Figure(name, panels, caption, height=1.5) for name, panels in figures if panels]
+
+
+def _panel(watch: Watch, name: str, *sides: str) -> Panel:
+    """A number over time, by the observers of some sides."""
+    values, limit, half = watch.values, watch.task.alarm_gap, 0.5 * watch.task.interval
+    time, parts, curves, inside = values["t"].to_numpy(float), [], [], []
+    if name == "half_gap" and limit is not None:
+        inside = [limit]
+        starts, ends = find_runs(values["alarm"].to_numpy(bool))
+        parts += [
+            Span(start, end, "alarm", VERMILION, opacity=0.12)
+            for start, end in zip(time[starts] - half, time[ends - 1] + half, strict=True)
+        ]
+        parts.append(Span(limit, limit, "limit", along="y", width=1.2))
+    for side in sides:
+        middle, error = (values[f"{side}.{name}{kind}"].astype(float) for kind in ("", "_error"))
+        low, high = middle - INTERVAL * error, middle + INTERVAL * error
+        colour = SIDE_COLOURS[side]
+        parts += [Band(time, low, high, "", colour), Line(time, middle, f"by the {side}'s observer", colour)]
+        # what is hardly determined would set the scale of all else
+        sure = error <= 3.0 * error.median()
+        curves += [middle[sure], low[sure], high[sure]]
+    lead = f"{sides[0]} " if len(sides) == 1 else ""
+    y = Axis(f"{LABELS[name]}\n{lead}({watch.task.units[sides[0]][name]})", ends=limits(*curves, inside=inside))
+    return Panel(Axis("time (s)", ends=(time[0] - half, time[-1] + half)), y, parts)

@@ -1,6 +1,7 @@
 """Medians and extremes of many runs: the same by few passes over kept rows as by many over parts."""
 
 from io import BytesIO
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from matplotlib.text import Text
 from small_study import ALPHA, LAMBDA, NOISE, listed_axis, make_result, rigid_study, spaced_axis
 
 from jaxbl.report import aggregates
-from jaxbl.report.aggregates import Column, Groups, spread
+from jaxbl.report.aggregates import Groups
 from jaxbl.report.results import write_report
 from jaxbl.sweeps.engine import Engine
 from jaxbl.sweeps.run import open_or_create_store
@@ -32,10 +33,12 @@ def test_spread_is_that_of_pandas(monkeypatch, kind, most):
     group_of, values = rng.integers(0, 20, 3000), NUMBERS[kind](rng, 3000)
     values[(rng.random(3000) < 0.1) | (group_of == 7)] = np.nan
     monkeypatch.setattr(aggregates, "MOST_VALUES", most)
-    actual = spread(lambda: ((group_of[i : i + 257], values[i : i + 257]) for i in range(0, 3000, 257)), 21)
-    groups = pd.Series(values).groupby(group_of)
+    frame = pd.DataFrame({"group": group_of, "value": values})
+    rows = [frame.iloc[i : i + 257] for i in range(0, 3000, 257)]
+    actual = Groups(rows, ["group"]).spread(itemgetter("value"))
+    groups = frame.groupby("group")["value"]
     for name, expected in (("least", groups.min()), ("median", groups.median()), ("largest", groups.max())):
-        np.testing.assert_array_equal(getattr(actual, name), expected.reindex(range(21)))
+        np.testing.assert_array_equal(actual[name], expected)
 
 
 def test_groups_are_those_of_pandas():
@@ -48,12 +51,12 @@ def test_groups_are_those_of_pandas():
     parts = [frame.iloc[i : i + 90] for i in range(0, 500, 90)]
     groups = Groups(parts, ["a", "b"], ["a", "c"])
     expected = frame.groupby(["a", "b"], sort=True)["v"]
-    column = Column(["v"], lambda part: part["v"])
+    column = itemgetter("v")
     means = groups.means({"v": column})
     assert groups.varied == {"a"}
     pd.testing.assert_series_equal(means["v"], expected.mean())
     pd.testing.assert_series_equal(means["rows"], expected.size(), check_names=False)
-    pd.testing.assert_series_equal(groups.medians(column), expected.median(), check_names=False)
+    pd.testing.assert_series_equal(groups.spread(column)["median"], expected.median(), check_names=False)
 
 
 def store_result(folder, data, **columns):

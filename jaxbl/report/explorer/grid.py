@@ -151,7 +151,7 @@ def _stars(
         frame = runs.assign(**{name: cells[name][index].ravel() for name in needed})
         if frame[["finite", f"{side}.converged"]].isna().to_numpy().any():
             continue
-        worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first, f"{side}.margin_alpha" in needed)
+        worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first)
         if (best := best_gains(worst)) is not None:
             place = _place_in_all([*index, 0], x, y)
             gains_there = zip(values, worst.index[best.index], strict=True)

@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.report.checks import has_words
-from jaxbl.report.error_plane import error_path, plane_reach
+from jaxbl.report.error_plane import error_path
 from jaxbl.report.maps import axis_words, value_label
 from jaxbl.report.panels import MAP, pack_numbers
 from jaxbl.report.sweep import answer_sweep
@@ -178,12 +178,11 @@ def simulated(config: Config, asked: Any) -> JsonObject:
     planes = {}
     for side, judged in trial.summary["conditions"].items():
         path = error_path(trial.trace, side, judged)
-        e, slope = path.majorant
         planes[side] = {
             "error": pack_numbers(drawable(path.error)),
             "slope": pack_numbers(drawable(path.slope)),
-            "reach": [plane_reach(path.error, e), plane_reach(path.slope, slope)],
-            "majorant": [pack_numbers(e), pack_numbers(slope)] if len(e) else None,
+            "reach": path.reach,
+            "majorant": [*map(pack_numbers, path.majorant)] if len(path.majorant[0]) else None,
         }
     return {
         "every": step,

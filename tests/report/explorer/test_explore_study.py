@@ -302,7 +302,6 @@ def test_the_first_view_is_the_slice_with_a_border_and_has_the_best_gains(tmp_pa
     runs = worst_runs(
         Groups([result.frame[result.frame[NOISE] > 5e-5]], [LAMBDA, ALPHA], [LAMBDA, ALPHA, "seed"]),
         "motor.velocity_rmse",
-        True,
     )
     best = best_gains(runs)
     place = runs.index[best.index]
