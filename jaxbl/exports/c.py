@@ -21,7 +21,6 @@ _TYPES = {
     "bool": "bool",
 }
 C_MARKS = "/*", "*/"
-_WIDTH = 110
 
 
 class Code(NamedTuple):
@@ -98,7 +97,7 @@ def write_signatures(program: Program) -> tuple[str, str]:
         for quantities in (block.start_inputs, block.inputs)
     )
     outputs = f"{name}_outputs *outputs"
-    start = ", ".join([f"{name}_state *state", *first, *([outputs] if block.start_gives_outputs else [])])
+    start = ", ".join([f"{name}_state *state", *first, *[outputs] * (len(program.start.results) > len(program.state))])
     step = ", ".join([f"{name}_state *state", *inputs, outputs])
     return f"void {name}_init({start})", f"void {name}_step({step})"
 
@@ -112,7 +111,9 @@ def _write_struct(name: str, members: Sequence[Port]) -> list[str]:
 
 
 class _C(Writer):
-    marks = C_MARKS
+    marks, assignment = C_MARKS, "="
+    choice, otherwise = "if (%s)\n{", "}\nelse\n{"
+    end_choice = end_repeat = "}"
 
     def __init__(self, program: Program):
         super().__init__(program)
@@ -196,21 +197,9 @@ class _C(Writer):
         zero = self.literal(Constant(np.asarray(0, out.dtype)))
         self.add_lines(f"{c_type(out.dtype)} {self.name(out)} = {text or zero};")
 
-    def assign(self, name, text):
-        self.add_lines(f"{name} = {text};")
-
     def begin_repeat(self, times):
         index = self.make_unique("i")
         self.add_lines(f"for (uint32_t {index} = 0u; {index} < {times}u; {index}++)", "{")
-
-    def begin_if(self, condition):
-        self.add_lines(f"if ({condition})", "{")
-
-    def begin_else(self):
-        self.add_lines("}", "else", "{")
-
-    def end(self, statement):
-        self.add_lines("}")
 
     def write_operation(self, operation):
         self.define(operation.out, self._write_expression(operation))

@@ -9,7 +9,7 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, count
+from itertools import chain
 from typing import Any, NamedTuple, TypeGuard
 
 import jax
@@ -25,14 +25,12 @@ _LONGEST_FORMULA = 90
 """Letters of a formula in a comment."""
 
 
+@dataclass(eq=False)
 class Variable:
     """A number that the code computes or takes as an argument; `name` is "" for a numbered one."""
 
-    def __init__(self, dtype: np.dtype, number: int, name: str = ""):
-        self.dtype, self.number, self.name = dtype, number, name
-
-    def __repr__(self) -> str:
-        return self.name or f"v{self.number}"
+    dtype: np.dtype
+    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,13 +209,12 @@ class _Lowering(ScalarWriter):
         self._variable_by_operation: dict[Any, Variable] = {}
         """The variable that holds the result of an operation, by the operation's name, type and operands."""
         self._operation_by_variable: dict[Value, Operation] = {}
-        self._numbers = count()
         self._source = ""
         self._is_in_call = False
         """Within a call the source stays that of the call."""
 
     def variable(self, dtype: Any) -> Variable:
-        return Variable(np.dtype(dtype), next(self._numbers))
+        return Variable(np.dtype(dtype))
 
     # jaxprs
 

@@ -2,6 +2,7 @@
 
 import abc
 import re
+import textwrap
 from collections.abc import Sequence
 from itertools import chain, count
 from typing import Any
@@ -30,9 +31,16 @@ class Writer(abc.ABC):
     """Writes the routines of a program as lines. A statement does one operation, so that compilers that contract only within
     statements contract nothing."""
 
-    indent = "    "
     marks: tuple[str, str]
     """Those between which a comment stands."""
+    assignment: str
+    """The sign between a variable and its new value."""
+    choice: str
+    """Lines that begin a choice, with a place for its condition."""
+    otherwise: str
+    """Lines that begin the other branch of a choice."""
+    end_choice: str
+    end_repeat: str
 
     def __init__(self, program: Program):
         self.program = program
@@ -53,16 +61,8 @@ class Writer(abc.ABC):
         """Write a number."""
 
     @abc.abstractmethod
-    def define(self, out: Variable, text: str) -> None:
-        """Define a variable that does not change."""
-
-    @abc.abstractmethod
     def declare(self, out: Variable, text: str | None) -> None:
         """Declare a variable that changes later, with its first value if there is one."""
-
-    @abc.abstractmethod
-    def assign(self, name: str, text: str) -> None:
-        """Change a variable."""
 
     @abc.abstractmethod
     def write_operation(self, operation: Operation) -> None:
@@ -72,23 +72,20 @@ class Writer(abc.ABC):
     def begin_repeat(self, times: int) -> None:
         """Begin a loop."""
 
-    @abc.abstractmethod
-    def begin_if(self, condition: str) -> None:
-        """Begin a choice."""
-
-    @abc.abstractmethod
-    def begin_else(self) -> None:
-        """Begin the other branch of a choice."""
-
-    @abc.abstractmethod
-    def end(self, statement: str) -> None:
-        """End a "repeat" or an "if"."""
-
     # what they have in common
 
-    def add_lines(self, *lines: str) -> None:
-        """Add lines at the present depth."""
-        self.lines += [f"{self.indent * self._depth}{line}" if line else "" for line in lines]
+    def add_lines(self, *texts: str) -> None:
+        """Add texts of one or more lines at the present depth."""
+        for text in texts:
+            self.lines += textwrap.indent(text, "    " * self._depth).split("\n")
+
+    def define(self, out: Variable, text: str) -> None:
+        """Define a variable that does not change."""
+        self.declare(out, text)
+
+    def assign(self, name: str, text: str) -> None:
+        """Change a variable."""
+        self.add_lines(f"{name} {self.assignment} {text};")
 
     def text(self, value: Value) -> str:
         """Write a value in an expression."""
@@ -136,14 +133,14 @@ class Writer(abc.ABC):
         self.write_statements(loop.body.statements)
         self._assign_together(loop.carried, loop.body.results)
         self._depth -= 1
-        self.end("repeat")
+        self.add_lines(self.end_repeat)
 
     def _assign_together(self, variables: Sequence[Variable], results: Sequence[Value]) -> None:
         """Assign results to variables, all at once: a variable that is read after its assignment is copied first."""
         texts, assigned = [], set()
         for variable, value in zip(variables, results, strict=True):
             if value in assigned and isinstance(value, Variable):
-                old_value = Variable(value.dtype, -1)
+                old_value = Variable(value.dtype)
                 self.define(old_value, self.text(value))
                 value = old_value
             texts.append(self.text(value))
@@ -157,7 +154,7 @@ class Writer(abc.ABC):
         short = not no.statements
         for variable, value in zip(choice.outs, no.results, strict=True):
             self.declare(variable, self.text(value) if short else None)
-        self.begin_if(self.text(choice.condition))
+        self.add_lines(self.choice % self.text(choice.condition))
         for body in choice.bodies:
             self._depth += 1
             self.write_statements(body.statements)
@@ -167,8 +164,8 @@ class Writer(abc.ABC):
             if short:
                 break
             if body is yes:
-                self.begin_else()
-        self.end("if")
+                self.add_lines(self.otherwise)
+        self.add_lines(self.end_choice)
 
 
 def _shorten_source(source: str) -> str:
