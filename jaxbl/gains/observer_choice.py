@@ -25,8 +25,8 @@ from jaxbl.observer import OBSERVERS, OperatingConditions
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points, draw_sobol
 
-from .pilot import Scenarios, list_axes, list_scenarios, run_pilot
-from .stages import Stages, stage_tables
+from .pilot import Scenarios, list_scenarios, run_pilot
+from .stages import GainChoice, Stages, describe_holdout, stage_tables
 
 TIME_CONSTANT = "equivalent_control.time_constant"
 """Searched together with the gains if the torque is the objective: its estimate is behind this low-pass."""
@@ -42,21 +42,8 @@ GainValues = dict[str, float]
 """Values of gains by config path."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ObserverChoice:
-    """Kinds of observer compared, each with tuned gains.
-
-    Attributes:
-        config: the study.
-        summary: plain data, as in `tuning.json`.
-        cost: seconds of compilation and of computing, and lanes computed in this call.
-        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
-    """
-
-    config: Config
-    summary: JsonObject
-    cost: dict[str, float]
-    fallback_reasons: tuple[str, ...] = ()
+class ObserverChoice(GainChoice):
+    """Kinds of observer compared, each with tuned gains."""
 
 
 @dataclasses.dataclass
@@ -187,11 +174,11 @@ class _KindSearch:
                 trials = [{side: search.trial_gains(unit) for side, search in sides.items()} for sides in searches]
                 for side_set in self._side_sets():
                     rows = []
-                    for i, sides in enumerate(trials):
+                    for point, sides in zip(group.points, trials, strict=True):
                         columns = self._merge_gains(sides, side_set)
-                        rows += [(i, {path: float(v[j]) for path, v in columns.items()}) for j in range(len(unit))]
+                        rows += [(point, {path: float(v[j]) for path, v in columns.items()}) for j in range(len(unit))]
                     name = f"{kind}-{'-'.join(side_set)}-{number}-{stage}"
-                    errors = self._run_trials(kind, group, rows, name, side_set)
+                    errors = self._run_trials(kind, rows, name, side_set)
                     for side in side_set:
                         worst = errors[side].max(axis=1).reshape(len(searches), len(unit))
                         for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
@@ -202,15 +189,15 @@ class _KindSearch:
         for number, group in enumerate(self.groups):
             for side_set in self._side_sets():
                 rows = []
-                for i, point in enumerate(group.points):
+                for point in group.points:
                     best = {side: point.searches[kind][side].best for side in self.sides}
-                    rows += [(i, self._merge_gains(best, side_set))] if all(best.values()) else []
+                    rows += [(point, self._merge_gains(best, side_set))] if all(best.values()) else []
                 if not rows:
                     continue
                 name = f"{kind}-{'-'.join(side_set)}-{number}-holdout"
-                errors = self._run_trials(kind, group, rows, name, side_set, held_out=True)
-                for row, (i, _) in enumerate(rows):
-                    group.points[i].held_out.setdefault(kind, {}).update({side: errors[side][row] for side in side_set})
+                errors = self._run_trials(kind, rows, name, side_set, held_out=True)
+                for row, (point, _) in enumerate(rows):
+                    point.held_out.setdefault(kind, {}).update({side: errors[side][row] for side in side_set})
 
     def _start_searches(self, kind: str, point: MapPoint, config: Config) -> dict[str, SideSearch]:
         """Start the searches of a kind at a point, one per side, with the ranges of its gains."""
@@ -232,60 +219,48 @@ class _KindSearch:
     def _run_trials(
         self,
         kind: str,
-        group: PointGroup,
-        rows: Sequence[tuple[int, GainValues]],
+        rows: Sequence[tuple[MapPoint, GainValues]],
         name: str,
         sides: tuple[str, ...],
         *,
         held_out: bool = False,
     ) -> NamedArrays:
-        """Run trials (`rows`: index of the point in its group, gains), and return errors by side, shape (rows, seeds).
+        """Run trials (`rows`: point of a group, gains), and return errors by side, shape (rows, seeds).
 
         They are the worst over the scenarios, and infinite if a run diverged or took too long to converge.
         """
-        columns: dict[str, list[float]] = {}
-        for i, gains in rows:
-            point = group.points[i]
-            starts = {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
-            for corner in range(len(point.scenarios.names)):
-                corner_values = {path: column[corner] for path, column in point.scenarios.columns.items()}
-                values = point.lane | starts | gains | corner_values
-                for path, value in values.items():
-                    columns.setdefault(path, []).append(value)
-        seeds = self.held_out_seeds if held_out else self.seeds
-        # gains that were rounded to the same number are run once
-        keys = list(zip(*columns.values(), strict=True))
-        unique = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-        config = group.points[0].scenarios.config
-        data = stage_tables(config, name, self.table, seeds if held_out else None)
-        data["observer"] = _observer_table(kind, data["observer"], columns)
-        data["axes"] = list_axes({"trial": dict(zip(columns, map(list, zip(*unique, strict=True)), strict=True))})
-        error_columns = [f"{side}.{self.table.objective}_rmse" for side in sides]
-        time_columns = [f"{side}.convergence_time" for side in sides] if self.table.longest_convergence is not None else []
-        frame = self.stages.run(data, name).read([*columns, "seed", *error_columns, *time_columns])
-        points = pd.DataFrame(list(unique), columns=list(columns)).assign(row=range(len(unique)))
-        frame = points.merge(frame, on=list(columns), validate="one_to_many").sort_values(["row", "seed"])
-        assert len(frame) == len(unique) * seeds
-        errors_by_side = {}
-        for i, side in enumerate(sides):
-            values = frame[error_columns[i]].to_numpy(float)
-            is_good = np.isfinite(values)
-            if time_columns:
-                is_good &= frame[time_columns[i]].to_numpy(float) <= self.table.longest_convergence
-            errors = np.where(is_good, values, np.inf).reshape(len(unique), seeds)[[unique[key] for key in keys]]
-            errors_by_side[side] = errors.reshape(len(rows), -1, seeds).max(axis=1)
+        trials = pd.DataFrame([
+            point.lane
+            | {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
+            | gains
+            | {path: column[corner] for path, column in point.scenarios.columns.items()}
+            for point, gains in rows
+            for corner in range(len(point.scenarios.names))
+        ])  # fmt: skip
+        tables = stage_tables(rows[0][0].scenarios.config, name, self.table, self.held_out_seeds if held_out else None)
+        tables["observer"] = _observer_table(kind, tables["observer"], trials.iloc[0].to_dict())
+        longest, errors_by_side = self.table.longest_convergence, {}
+        names = [f"{self.table.objective}_rmse", *(["convergence_time"] if longest is not None else [])]
+        metrics = self.stages.run_trials(tables, name, trials, [f"{side}.{metric}" for side in sides for metric in names])
+        for side in sides:
+            errors = metrics[f"{side}.{names[0]}"]
+            is_good = np.isfinite(errors)
+            if longest is not None:
+                is_good &= metrics[f"{side}.convergence_time"] <= longest
+            errors = np.where(is_good, errors, np.inf)
+            errors_by_side[side] = errors.reshape(len(rows), -1, errors.shape[1]).max(axis=1)
         return errors_by_side
 
 
-def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[str, Sequence[float]]) -> JsonObject:
-    """Return the `[observer]` table of a kind, with the first trial's gains."""
+def _observer_table(kind: str, study_table: Mapping[str, Any], trial: Mapping[str, Any]) -> JsonObject:
+    """Return the `[observer]` table of a kind, with a trial's gains."""
     data: JsonObject = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)}
     data["kind"] = kind
-    for path, values in columns.items():
+    for path, value in trial.items():
         section, _, side_key = path.partition(".")
         if section == "observer":
             side, key = side_key.split(".")
-            data.setdefault(side, {"position_error": study_table[side]["position_error"]})[key] = values[0]
+            data.setdefault(side, {"position_error": study_table[side]["position_error"]})[key] = value
     return data
 
 
@@ -383,21 +358,17 @@ def _summary(search: _KindSearch) -> JsonObject:
                     "kinds": ranking,
                 }
             points.append({"values": point.values, "sides": sides})
-    first = config.sweep.first_seed + search.seeds
+    first = config.sweep.first_seed
     summary = {
         "title": config.title,
         "objective": table.objective,
         "objective_metric": f"{table.objective}_rmse ({SIDE_METRICS[f'{table.objective}_rmse'].unit})",
         "observers": table.observers,
         "trials": table.trials * (1 + table.refine),
-        "seeds": [config.sweep.first_seed, first - 1],
+        "seeds": [first, first + search.seeds - 1],
         "scenarios": search.groups[0].points[0].scenarios.names,
         "axes": [axis.path for axis in table.axes],
-        "holdout": {
-            "excitation": (table.holdout or config.excitation).model_dump(by_alias=True, exclude_none=True),
-            "same_excitation": table.holdout is None,
-            "seeds": [first, first + search.held_out_seeds - 1],
-        },
+        "holdout": describe_holdout(config, table, search.held_out_seeds),
         "points": points,
     }
     if len(points) == 1:

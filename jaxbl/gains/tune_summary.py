@@ -16,6 +16,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from .best_gains import NEARLY_AS_GOOD
 from .gain_search import GAIN_METRICS, GainSearch, Window
 from .limits import LEAST_DIFFERENCE, find_limits
+from .stages import describe_holdout
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -75,14 +76,9 @@ class Summary:
             "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cell_ratios(side).items()} for side in sides},
             "stages": [{side: _ratio_ranges(window) for side, window in windows.items()} for windows in search.windows],
             "named": self.named_rows,
-            "holdout": {
-                "excitation": (table.holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
-                "same_excitation": table.holdout is None,
-                "seeds": [first + seeds, first + 2 * seeds - 1],
-                "f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides},
-                "rows": self.held_out_rows,
-                "factors": self.factors,
-            },
+            "holdout": describe_holdout(self.config, table, seeds)
+            | {"f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides}}
+            | {"rows": self.held_out_rows, "factors": self.factors},
             "pareto": {side: self._front(side) for side in sides},
             "remarks": [*self.config.notes, *self._remarks()],
         }

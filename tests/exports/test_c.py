@@ -371,9 +371,8 @@ def test_in_float_many_turns_away_it_is_as_good_as_near_zero(tmp_path, kind, rat
 
 def test_the_same_study_has_the_same_code_in_each_process(tmp_path):
     # sets of variables have another order in each process
+    study = Path(__file__).parents[2] / "sweeps" / "gain_map.toml"
     script = "import sys, jaxbl; jaxbl.export(sys.argv[1], sys.argv[2], precision='float', name='drive')"
     for run in ("first", "second", "third"):
-        subprocess.run(
-            [sys.executable, "-c", script, Path(__file__).parents[2] / "sweeps/gain_map.toml", tmp_path / run], check=True
-        )
+        subprocess.run([sys.executable, "-c", script, study, tmp_path / run], check=True)
     assert len({(tmp_path / run / "drive.c").read_text() for run in ("first", "second", "third")}) == 1
