@@ -1,6 +1,7 @@
 """A block to write code for: a state, a step from sample to sample, and names for all inputs and outputs."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import compress
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from .lowering import (
     are_same,
     default_precision,
     drop_unread,
+    drop_unread_turns,
     lower_to_operations,
 )
 
@@ -182,22 +184,15 @@ def lower_block(block: Block) -> Program:
                 break
             constant_states = unchanged_states
     count = len(state)
-    outputs, read_states = step.results[count:], set[int]()
-    while True:
-        needed = Routine(step.statements, (*(step.results[i] for i in sorted(read_states)), *outputs))
-        needed, read = drop_unread(needed)
-        states_read_now = {i for i, variable in enumerate(state) if variable in read and i not in constant_states}
-        if states_read_now == read_states:
-            break
-        read_states = states_read_now
-    kept_indices = sorted(read_states)
-    start_results = *(start_routine.results[i] for i in kept_indices), *start_routine.results[count:]
+    outputs = step.results[count:]
+    needed, _, alive = drop_unread_turns(step, [*state, *[None] * len(outputs)], [False] * count + [True] * len(outputs))
+    start_results = *compress(start_routine.results[:count], alive), *start_routine.results[count:]
     return Program(
         block,
-        tuple(block.state[i] for i in kept_indices),
+        tuple(compress(block.state, alive)),
         drop_unread(Routine(start_routine.statements, start_results))[0],
         needed,
-        tuple(state[i] for i in kept_indices),
+        tuple(compress(state, alive)),
     )
 
 

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from jaxbl.config import Config
-from jaxbl.errors import escape_unprintable
+from jaxbl.errors import NoResult, escape_unprintable
 from jaxbl.sweeps.store import identity
 
 from .block import Port
@@ -149,19 +149,18 @@ def _compile_binaries(name: str, fmi: int, sources: Mapping[str, str]) -> tuple[
         if target is None or folder is None:
             missing.append(f"for {' on '.join(system)} none is compiled in FMI {FMI[fmi]}")
             continue
-        content, fault = _compile_binary(name, target, sources)
-        if fault:
-            missing.append(fault)
-        else:
-            binaries[folder] = f"{name}.{target.ending}", content
+        try:
+            binaries[folder] = f"{name}.{target.ending}", _compile_binary(name, target, sources)
+        except NoResult as error:
+            missing.append(str(error))
     return binaries, missing
 
 
-def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> tuple[bytes, str]:
-    """Compile the sources for a platform. Returns the binary, or b"" and the reason why there is none."""
+def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> bytes:
+    """Compile the sources for a platform. Raises `NoResult` with the reason why there is no binary."""
     compiler = shutil.which(target.compiler)
     if compiler is None:
-        return b"", f"no C compiler ({target.compiler}) was found"
+        raise NoResult(f"no C compiler ({target.compiler}) was found")
     with TemporaryDirectory() as folder:
         for file, text in sources.items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
@@ -177,11 +176,11 @@ def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> 
                 timeout=_LONGEST_COMPILATION,
             )
         except (OSError, subprocess.TimeoutExpired) as error:
-            return b"", f"{compiler} did not run ({error})"
+            raise NoResult(f"{compiler} did not run ({error})") from None
         if process.returncode:
             errors = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
-            return b"", f"{compiler} failed: {errors[0]}"
-        return (Path(folder) / library).read_bytes(), ""
+            raise NoResult(f"{compiler} failed: {errors[0]}")
+        return (Path(folder) / library).read_bytes()
 
 
 # variables
@@ -204,7 +203,8 @@ def _list_variables(plant: PlantProgram) -> list[Scalar]:
         minimum = parameter.minimum if parameter.above is None else parameter.above
         variables.append(
             Scalar(
-                _to_structured_name(path),
+                # by FMI's "structured" naming convention
+                re.sub(r"\.(\d+)(?=\.)", r"[\1]", path),
                 "parameter",
                 kind,
                 parameter.unit,
@@ -216,11 +216,6 @@ def _list_variables(plant: PlantProgram) -> list[Scalar]:
             )
         )
     return variables
-
-
-def _to_structured_name(path: str) -> str:
-    """Write a config path by FMI's "structured" naming convention: `effects.0.torque` becomes `effects[0].torque`."""
-    return re.sub(r"\.(\d+)(?=\.)", r"[\1]", path)
 
 
 _BASES: dict[str, dict[str, int]] = {
@@ -321,17 +316,15 @@ def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: i
         attributes["initial"] = "exact"
     elif variable.causality != "independent" and variable.start is None:
         attributes["initial"] = "calculated"
+    if variable.about:
+        attributes["description"] = variable.about
     number = {"unit": write_unit(variable.unit)} if variable.unit else {}
-    number |= {
-        key: _write_number(value)
-        for key, value in (("min", variable.least), ("max", variable.most), ("start", variable.start))
-        if value is not None
-    }
-    text = {"description": variable.about} if variable.about else {}
+    limits = {"min": variable.least, "max": variable.most, "start": variable.start}
+    number |= {key: _write_number(value) for key, value in limits.items() if value is not None}
     if fmi == 3:
-        ET.SubElement(parent, "Float64", attributes | text | number)
+        ET.SubElement(parent, "Float64", attributes | number)
     else:
-        ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes | text), "Real", number)
+        ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes), "Real", number)
 
 
 def _write_build_description(name: str, sources: Sequence[str]) -> str:
@@ -359,7 +352,9 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
     name, real = block.name, c_type(block.dtype)
     double = "" if real == "double" else "(double)"
     single = "" if real == "double" else "(float)"
-    reference = {variable.name: i for i, variable in enumerate(variables)}
+    # the names in code, in the order of `variables`
+    names = "time", block.inputs[0].name, *(port.name for port in block.outputs), *plant.parameters
+    reference = {name: i for i, name in enumerate(names)}
     change_rules = {"input": "ALWAYS", "fixed": "FIXED", "tunable": "ALWAYS"}
     rows = []
     for variable in variables:
@@ -372,18 +367,15 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
         rows.append(f'    {{"{variable.name}", {change_rule}, {start}, {low}, {high}, {is_open}}},')
 
     def write_arguments(quantities: Sequence[Port]) -> str:
-        places = (
-            reference[_to_structured_name(plant.parameters.get(quantity.name, quantity.name))] for quantity in quantities
-        )
-        arguments = ["&model->state", *(f"{single}model->values[{i}]" for i in places), "&outputs"]
+        values = (f"{single}model->values[{reference[quantity.name]}]" for quantity in quantities)
+        arguments = ["&model->state", *values, "&outputs"]
         # four a line
         return ",\n        ".join(", ".join(arguments[i : i + 4]) for i in range(0, len(arguments), 4))
 
     start_arguments, step_arguments = map(write_arguments, (block.start_inputs, block.inputs))
 
     outputs = [
-        f"    model->values[{reference[plant.outputs[variable.name]]}] = {double}outputs.{variable.name};"
-        for variable in block.outputs
+        f"    model->values[{reference[variable.name]}] = {double}outputs.{variable.name};" for variable in block.outputs
     ]
     longest_name = max(len(variable.name) for variable in variables)
     row_lines, output_lines = "\n".join(rows), "\n".join(outputs)

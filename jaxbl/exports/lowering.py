@@ -9,7 +9,7 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, compress
 from typing import Any, NamedTuple, TypeGuard
 
 import jax
@@ -163,24 +163,39 @@ def drop_unread(routine: Routine) -> tuple[Routine, set[Variable]]:
             needed_statements.append(statement)
         elif isinstance(statement, Repeat):
             carried = statement.carried
-            alive = [variable in needed for variable in carried]
-            while True:
-                body, inside = drop_unread(_select_results(statement.body, alive))
-                before, alive = alive, [is_alive or carry in inside for is_alive, carry in zip(alive, carried, strict=True)]
-                if before == alive:
-                    break
+            body, inside, alive = drop_unread_turns(statement.body, carried, [variable in needed for variable in carried])
             if any(alive):
-                carried, start = _select_marked(carried, alive), _select_marked(statement.start, alive)
+                carried, start = tuple(compress(carried, alive)), tuple(compress(statement.start, alive))
                 needed = (needed | inside) - set(carried) | select_variables(start)
                 needed_statements.append(statement._replace(carried=carried, start=start, body=body))
         else:
             alive = [variable in needed for variable in statement.outs]
             if any(alive):
-                outs = _select_marked(statement.outs, alive)
+                outs = tuple(compress(statement.outs, alive))
                 bodies, inside = zip(*(drop_unread(_select_results(body, alive)) for body in statement.bodies), strict=True)
                 needed = needed.difference(outs).union(*inside, select_variables([statement.condition]))
                 needed_statements.append(statement._replace(outs=outs, bodies=bodies))
     return Routine(tuple(reversed(needed_statements)), routine.results), needed
+
+
+def drop_unread_turns(
+    body: Routine, carried: Sequence[Variable | None], alive: Sequence[bool]
+) -> tuple[Routine, set[Variable], Sequence[bool]]:
+    """Drop what nothing reads in any turn of a routine that is repeated.
+
+    Args:
+        body: the routine.
+        carried: for each of its results, the variable that it becomes in the next turn, or None.
+        alive: for each of them True if it is read after the last turn.
+
+    Returns:
+        The routine, the variables that it reads and does not compute, and which of the results are kept.
+    """
+    while True:
+        needed, inside = drop_unread(_select_results(body, alive))
+        before, alive = alive, [is_alive or carry in inside for is_alive, carry in zip(alive, carried, strict=True)]
+        if before == alive:
+            return needed, inside, alive
 
 
 def are_same(first: Value, second: Value) -> bool:
@@ -191,11 +206,7 @@ def are_same(first: Value, second: Value) -> bool:
 
 
 def _select_results(routine: Routine, marks: Sequence[bool]) -> Routine:
-    return routine._replace(results=_select_marked(routine.results, marks))
-
-
-def _select_marked(candidates: Sequence[Any], marks: Sequence[bool]) -> tuple[Any, ...]:
-    return tuple(candidate for candidate, marked in zip(candidates, marks, strict=True) if marked)
+    return routine._replace(results=tuple(compress(routine.results, marks)))
 
 
 class _Lowering(ScalarWriter):
@@ -260,7 +271,7 @@ class _Lowering(ScalarWriter):
         differ = [not are_same(a, b) for a, b in zip(yes.results, no.results, strict=True)]
         merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)]
         bodies = _select_results(yes, differ), _select_results(no, differ)
-        self.statements.append(Choice(condition, _select_marked(merged, differ), bodies, source))
+        self.statements.append(Choice(condition, tuple(compress(merged, differ)), bodies, source))
         return merged
 
     def lower_body(self, body: ClosedJaxpr, arguments: Sequence[Value]) -> Routine:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbl.config import Config, read_config
 from jaxbl.json_types import JsonObject
-from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, bisect, peak_ratio
 from jaxbl.sweeps.trial import run
 
 from .below_bound import friction_rate, missing_acceleration, share_of_time_above
@@ -143,18 +143,13 @@ def _peak_ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, starting_
     def damped_ratio(speed: Any) -> Any:
         return half_cycle(lambda_, alpha, f_plus, damping=friction, speed=speed).ratio
 
-    def halve_range(bounds: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
-        low, high = bounds
-        middle = jnp.sqrt(low * high)
-        grows = damped_ratio(middle) >= 1.0
-        return (jnp.where(grows, middle, low), jnp.where(grows, high, middle)), None
-
     # beyond this speed friction alone brakes harder than alpha
     braking_speed = (alpha + f_plus) / jnp.maximum(friction, 1e-12)
+    least = 1e-6 * braking_speed
     # 40 halvings of seven decades: to a relative 1e-11
-    (upheld, _), _ = jax.lax.scan(halve_range, (1e-6 * braking_speed, 10.0 * braking_speed), length=40)
+    log_ratio, _ = bisect(lambda log: damped_ratio(least * jnp.exp(log)) < 1.0, jnp.full_like(least, jnp.log(1e7)), 40)
     undamped = peak_ratio(lambda_, alpha, f_plus)
-    start = jnp.where(starting_speed > 0.0, starting_speed, 1e-6 * braking_speed)
+    start = jnp.where(starting_speed > 0.0, starting_speed, least)
     constant_ratios = [
         half_cycle(lambda_, alpha, f_plus, damping=friction, speed=start, outward=sign, homeward=sign).ratio
         for sign in (1.0, -1.0)
@@ -163,5 +158,5 @@ def _peak_ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, starting_
         "peak_ratio": undamped,
         "peak_ratio_damped": damped_ratio(start),
         "peak_ratio_constant": jnp.sqrt(constant_ratios[0] * constant_ratios[1]),
-        "upheld_velocity_error": jnp.where(undamped < 1.0, 0.0, upheld),
+        "upheld_velocity_error": jnp.where(undamped < 1.0, 0.0, least * jnp.exp(log_ratio)),
     }

@@ -10,6 +10,7 @@ the same noise. With `tune.axes` this is done at each point of a grid.
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -394,12 +395,9 @@ def _describe_search(side: SideSearch, name: str) -> JsonObject:
 
 def _for_both_sides(sides: Mapping[str, Any], observers: Sequence[str]) -> str | None:
     """Return the kind with the least product of errors, as a study has one kind for both sides."""
-    total = {
-        kind: sum(math.log(summary["kinds"][kind]["ratio"]) for summary in sides.values())
-        for kind in observers
-        if all(summary["kinds"][kind]["ratio"] is not None for summary in sides.values())
-    }
-    return min(total, key=lambda kind: total[kind]) if total else None
+    ratios = {kind: [summary["kinds"][kind]["ratio"] for summary in sides.values()] for kind in observers}
+    products = {kind: math.prod(by_side) for kind, by_side in ratios.items() if None not in by_side}
+    return min(products, key=products.__getitem__, default=None)
 
 
 def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -420,22 +418,20 @@ def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[s
         )
     lines.append(f"{intervals} Another input or drive may rank otherwise.")
     for side in search.sides:
-        ends: dict[tuple[str, str], int] = {}
-        unfinished: dict[str, tuple[int, float]] = {}
-        for point in points:
-            for kind, rank in point["sides"][side]["kinds"].items():
-                for key in rank["at_range_end"]:
-                    ends[kind, key] = ends.get((kind, key), 0) + 1
-                if (rank["gained_by_last_zoom"] or 0.0) > _UNFINISHED_SHARE:
-                    count, most = unfinished.get(kind, (0, 0.0))
-                    unfinished[kind] = count + 1, max(most, rank["gained_by_last_zoom"])
+        ranks = [(kind, rank) for point in points for kind, rank in point["sides"][side]["kinds"].items()]
+        ends = Counter((kind, key) for kind, rank in ranks for key in rank["at_range_end"])
+        unfinished: dict[str, list[float]] = {}
+        for kind, rank in ranks:
+            if (gained := rank["gained_by_last_zoom"] or 0.0) > _UNFINISHED_SHARE:
+                unfinished.setdefault(kind, []).append(gained)
         share = f"of {len(points)} points" if len(points) > 1 else ""
         if ends:
             gains = ", ".join(f"{kind}.{key}{f' ({n} {share})' if share else ''}" for (kind, key), n in ends.items())
             lines.append(f"{side}: best values at an end of the range searched: {gains}. Beyond it may be better ones.")
         if unfinished:
             kind_list = ", ".join(
-                f"{kind} ({f'{n} {share}, ' if share else ''}{percent(most)})" for kind, (n, most) in unfinished.items()
+                f"{kind} ({f'{len(shares)} {share}, ' if share else ''}{percent(max(shares))})"
+                for kind, shares in unfinished.items()
             )
             lines.append(
                 f"{side}: the last zoom still made errors smaller by more than {100 * _UNFINISHED_SHARE:g} %: {kind_list}. "

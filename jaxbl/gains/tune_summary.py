@@ -58,7 +58,7 @@ class Summary:
         first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
         unit = SIDE_METRICS[f"{table.objective}_rmse"].unit
         keys = ("lambda", "alpha", "lambda_ratio", "alpha_ratio")
-        return {
+        return to_jsonable({
             "title": self.config.title,
             "objective": table.objective,
             "objective_metric": f"worst {table.objective}_rmse ({unit}) over seeds and scenarios",
@@ -68,7 +68,7 @@ class Summary:
             "pilot": search.pilot,
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "verdict": {side: self._judge_side(side) for side in sides},
-            "gains": {side: {key: float(self.best_candidates[side][key]) for key in keys} for side in sides},
+            "gains": {side: {key: self.best_candidates[side][key] for key in keys} for side in sides},
             "achieved": {side: self._achieved_metrics(side) for side in sides},
             "limits": self.limits,
             "conditions": self.conditions,
@@ -79,9 +79,12 @@ class Summary:
             "holdout": describe_holdout(self.config, table, seeds)
             | {"f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides}}
             | {"rows": self.held_out_rows, "factors": self.factors},
-            "pareto": {side: self._front(side) for side in sides},
+            "pareto": {
+                side: pareto_front(search.candidates[side])[[*keys, "convergence_time", "error"]].to_dict("records")
+                for side in sides
+            },
             "remarks": [*self.config.notes, *self._remarks()],
-        }
+        })  # fmt: skip
 
     def _judge_side(self, side: str) -> JsonObject:
         """Judge whether a side's gains matter, what limits the error, and how large the margin is.
@@ -94,19 +97,22 @@ class Summary:
         factor = float(feasible["error"].max()) / best.least_error
         tolerance = max(NEARLY_AS_GOOD, float(candidates["scatter"].iloc[best.index]))
         word = "range" if best.ends else "yes" if factor > 1.0 + tolerance else "no"
-        return to_jsonable(
-            {"gains_matter": word, "worst_over_least": factor, "least_error": best.least_error}
-            | {"margin": best.margin, "margins": best.margins, "causes": self.causes[side]}
-            | {"nearly_as_good": best.nearly_as_good, "tried": len(candidates)}
-        )
+        return {
+            "gains_matter": word,
+            "worst_over_least": factor,
+            "least_error": best.least_error,
+            "margin": best.margin,
+            "margins": best.margins,
+            "causes": self.causes[side],
+            "nearly_as_good": best.nearly_as_good,
+            "tried": len(candidates),
+        }
 
     def _achieved_metrics(self, side: str) -> JsonObject:
-        names, rho = (name for name in GAIN_METRICS if name != "converged"), self.conditions[side]["peak_ratio"]
-        return to_jsonable({name: self.best_candidates[side][name] for name in names} | {"peak_ratio": rho})
-
-    def _front(self, side: str) -> list[JsonObject]:
-        names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
-        return to_jsonable(pareto_front(self.search.candidates[side])[names].to_dict("records"))
+        names = (name for name in GAIN_METRICS if name != "converged")
+        return {name: self.best_candidates[side][name] for name in names} | {
+            "peak_ratio": self.conditions[side]["peak_ratio"]
+        }
 
     def _compare_with_tuned(self, side: str) -> JsonObject:
         """Divide other gains' metrics by the tuned gains', on the held-out input.
