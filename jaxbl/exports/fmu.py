@@ -226,14 +226,12 @@ _BASES: dict[str, dict[str, int]] = {
     "Hz": {"s": -1},
 }
 """Exponents of base units."""
-_POWERS = {"²": "2", "³": "3", "^": "", " ": "."}
+_POWERS = str.maketrans({"²": "2", "³": "3", "^": "", " ": "."})
 
 
 def write_unit(unit: str) -> str:
     """Write a unit as FMI tools do: `N.m.s2/rad2`."""
-    for letter, other in _POWERS.items():
-        unit = unit.replace(letter, other)
-    return unit
+    return unit.translate(_POWERS)
 
 
 def find_base_units(unit: str) -> dict[str, int] | None:

@@ -388,10 +388,6 @@ _READABLE_EQUATIONS = {*_INFIX, "neg", "abs", "sqrt", "square", "integer_pow", "
 """Equations with a formula that a reader understands."""
 
 
-def _evaluate_conversion(dtype: np.dtype, a: Any) -> Any:
-    return np.trunc(a) if dtype.kind in "iu" and a.dtype.kind == "f" else a
-
-
 _EVALUATIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(operator, name) for name in ("add", "sub", "mul", "neg", "lt", "le", "gt", "ge", "eq", "ne", "xor")},
     **{name: getattr(np, name) for name in ("abs", "sqrt", "floor", "ceil")},
@@ -410,7 +406,7 @@ _EVALUATIONS: dict[str, Callable[..., Any]] = {
 """How an operation is computed for constants, by the name of the :class:`Operation`."""
 _TYPED_EVALUATIONS: dict[str, Callable[..., Any]] = {
     "shift_right_logical": lambda dtype, a, b: a.view(f"u{dtype.itemsize}") >> b.view(f"u{dtype.itemsize}"),
-    "convert": _evaluate_conversion,
+    "convert": lambda dtype, a: np.trunc(a) if dtype.kind in "iu" and a.dtype.kind == "f" else a,
     "bitcast": lambda dtype, a: np.asarray(a).view(dtype),
     "power_of_two": lambda dtype, n: np.ldexp(dtype.type(1), int(n)),
 }

@@ -170,7 +170,7 @@ class Writer(abc.ABC):
 
 def _shorten_source(source: str) -> str:
     """Shorten the name of a source function by what Python adds to it."""
-    return source.replace("<locals>.", "").replace(".<dictcomp>", "").replace(".<genexpr>", "").replace(".<lambda>", "")
+    return re.sub(r"\.<(locals|dictcomp|genexpr|lambda)>", "", source)
 
 
 def find_unread_names(routine: Routine, quantities: Sequence[Port]) -> list[str]:
@@ -185,9 +185,10 @@ def write_shortest(value: Any) -> str:
     return text if any(mark in text for mark in ".en") else f"{text}.0"
 
 
-_LETTERS = {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho", "\\": "/"}
-
-
+_LETTERS = str.maketrans(
+    {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho", "\\": "/"}
+)
+"""What stands for letters that not every compiler reads, and for the one that joins lines."""
 _COMMENT_MARKS = "*/", "/*", "(*", "*)", "??"
 """Pairs of letters that begin or end a comment; two question marks begin a trigraph of C."""
 
@@ -201,12 +202,6 @@ def separate(text: str, *pairs: str) -> str:
 def write_comment(marks: tuple[str, str], *lines: str) -> str:
     """Write a comment between its marks. No line of it ends the comment, or is joined with the next one."""
     begin, end = marks
-    texts = (f"   {separate(to_ascii(line), *_COMMENT_MARKS)}".rstrip() for line in lines)
+    plain_lines = (line.translate(_LETTERS).encode("ascii", "replace").decode() for line in lines)
+    texts = (f"   {separate(line, *_COMMENT_MARKS)}".rstrip() for line in plain_lines)
     return f"{begin}{chr(10).join(texts)[2:]} {end}"
-
-
-def to_ascii(text: str) -> str:
-    """Replace the letters that not every compiler reads, and the one that joins lines."""
-    for letter, other in _LETTERS.items():
-        text = text.replace(letter, other)
-    return text.encode("ascii", "replace").decode()
