@@ -12,6 +12,7 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,13 +122,6 @@ class MapPoint(NamedTuple):
     held_out: dict[str, NamedArrays]
 
 
-class PointGroup(NamedTuple):
-    """Points with the same structure, and a config that has it."""
-
-    config: Config
-    points: list[MapPoint]
-
-
 def choose_observer(config: Config, table: TuneTable, stages: Stages) -> ObserverChoice:
     """Tune and compare the kinds `table.observers`; arguments as of :func:`.tune.tune`."""
     search = _KindSearch(config, table, stages)
@@ -147,7 +141,7 @@ class _KindSearch:
         self.seeds = config.sweep.seeds
         self.held_out_seeds = max(self.seeds, LEAST_HELD_OUT_SEEDS)
         self.groups = _group_points(config, table, stages)
-        rows = sum(len(point.scenarios.names) for group in self.groups for point in group.points)
+        rows = sum(len(point.scenarios.names) for point in chain.from_iterable(self.groups))
         runs = len(table.observers) * rows * len(self._side_sets())
         stages.total_lanes = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
 
@@ -158,58 +152,45 @@ class _KindSearch:
         """
         return [(side,) for side in self.sides] if self.table.objective == "torque" else [self.sides]
 
-    def _merge_gains(self, sides: Mapping[str, Mapping[str, Any]], side_set: tuple[str, ...]) -> JsonObject:
-        """Merge the gains of both sides for one run. A shared gain is taken from the sides that the run is for."""
-        return {path: value for side in reversed((*side_set, *self.sides)) for path, value in sides[side].items()}
-
     def tune(self, kind: str) -> None:
         """Find the gains of a kind on both sides, at all points."""
-        for group in self.groups:
-            for point in group.points:
-                point.searches[kind] = self._start_searches(kind, point, group.config)
-        for number, group in enumerate(self.groups):
-            searches = [point.searches[kind] for point in group.points]
+        for point in chain.from_iterable(self.groups):
+            point.searches[kind] = self._start_searches(kind, point)
+        for number, points in enumerate(self.groups):
+            searches = [point.searches[kind] for point in points]
             free = sum(low < high for low, high in searches[0][self.sides[0]].limits.values())
             for stage in range(1 + self.table.refine):
                 unit = draw_sobol(free, self.table.trials, stage)
                 trials = [{side: search.trial_gains(unit) for side, search in sides.items()} for sides in searches]
-                for side_set in self._side_sets():
-                    rows = []
-                    for point, sides in zip(group.points, trials, strict=True):
-                        columns = self._merge_gains(sides, side_set)
-                        rows += [(point, {path: float(v[j]) for path, v in columns.items()}) for j in range(len(unit))]
-                    name = f"{kind}-{'-'.join(side_set)}-{number}-{stage}"
-                    errors = self._run_trials(kind, rows, name, side_set)
-                    for side in side_set:
-                        worst = errors[side].max(axis=1).reshape(len(searches), len(unit))
-                        for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
-                            sides[side].zoom_in(trial[side], trial_errors)
+                rows = [
+                    (point, {side: {path: float(v[j]) for path, v in gains.items()} for side, gains in sides.items()})
+                    for point, sides in zip(points, trials, strict=True)
+                    for j in range(len(unit))
+                ]
+                for side, errors in self._run_trials(kind, f"{number}-{stage}", rows).items():
+                    worst = errors.max(axis=1).reshape(len(searches), len(unit))
+                    for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
+                        sides[side].zoom_in(trial[side], trial_errors)
 
     def run_held_out(self, kind: str) -> None:
         """Find the held-out errors of a tuned kind on all sides, at all points."""
-        for number, group in enumerate(self.groups):
-            for side_set in self._side_sets():
-                rows = []
-                for point in group.points:
-                    best = {side: point.searches[kind][side].best for side in self.sides}
-                    rows += [(point, self._merge_gains(best, side_set))] if all(best.values()) else []
-                if not rows:
-                    continue
-                name = f"{kind}-{'-'.join(side_set)}-{number}-holdout"
-                errors = self._run_trials(kind, rows, name, side_set, held_out=True)
-                for row, (point, _) in enumerate(rows):
-                    point.held_out.setdefault(kind, {}).update({side: errors[side][row] for side in side_set})
+        for number, points in enumerate(self.groups):
+            rows = [(point, {side: point.searches[kind][side].best for side in self.sides}) for point in points]
+            rows = [(point, best) for point, best in rows if all(best.values())]
+            errors = self._run_trials(kind, f"{number}-holdout", rows, held_out=True) if rows else {}
+            for i, (point, _) in enumerate(rows):
+                point.held_out[kind] = {side: errors[side][i] for side in self.sides}
 
-    def _start_searches(self, kind: str, point: MapPoint, config: Config) -> dict[str, SideSearch]:
+    def _start_searches(self, kind: str, point: MapPoint) -> dict[str, SideSearch]:
         """Start the searches of a kind at a point, one per side, with the ranges of its gains."""
-        config_there, searches = with_values(config, point.values), {}
+        config, searches = point.scenarios.config, {}
         for side in self.sides:
             bound = point.pilot[side]["f_plus"]
             if not bound > 0.0:
                 raise no_disturbance_error(side)
-            encoders = config_there.encoders.build()
+            encoders = config.encoders.build()
             noise = math.hypot(encoders.noise, _ROUNDING_RMS * encoders.resolution_of(side))
-            period = config_there.run.sample_period
+            period = config.run.sample_period
             ranges = OBSERVERS[kind].gain_ranges(OperatingConditions(bound, period, noise))
             limits = {f"observer.{side}.{gain}": ends for gain, ends in ranges.items()}
             if self.table.objective == "torque":
@@ -220,36 +201,39 @@ class _KindSearch:
     def _run_trials(
         self,
         kind: str,
-        rows: Sequence[tuple[MapPoint, GainValues]],
         name: str,
-        sides: tuple[str, ...],
+        rows: Sequence[tuple[MapPoint, Mapping[str, GainValues]]],
         *,
         held_out: bool = False,
     ) -> NamedArrays:
-        """Run trials (`rows`: point of a group, gains), and return errors by side, shape (rows, seeds).
+        """Run trials (`rows`: point of a group, gains by side), and return errors by side, shape (rows, seeds).
 
         They are the worst over the scenarios, and infinite if a run diverged or took too long to converge.
         """
-        trials = pd.DataFrame([
-            point.lane
-            | {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
-            | gains
-            | {path: column[corner] for path, column in point.scenarios.columns.items()}
-            for point, gains in rows
-            for corner in range(len(point.scenarios.names))
-        ])  # fmt: skip
-        tables = stage_tables(rows[0][0].scenarios.config, name, self.table, self.held_out_seeds if held_out else None)
-        tables["observer"] = _observer_table(kind, tables["observer"], trials.iloc[0].to_dict())
         longest, errors_by_side = self.table.longest_convergence, {}
         names = [f"{self.table.objective}_rmse", *(["convergence_time"] if longest is not None else [])]
-        metrics = self.stages.run_trials(tables, name, trials, [f"{side}.{metric}" for side in sides for metric in names])
-        for side in sides:
-            errors = metrics[f"{side}.{names[0]}"]
-            is_good = np.isfinite(errors)
-            if longest is not None:
-                is_good &= metrics[f"{side}.convergence_time"] <= longest
-            errors = np.where(is_good, errors, np.inf)
-            errors_by_side[side] = errors.reshape(len(rows), -1, errors.shape[1]).max(axis=1)
+        for sides in self._side_sets():
+            trials = pd.DataFrame([
+                point.lane
+                | {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
+                # a gain that sides share is taken from those that the runs are for
+                | {path: value for side in reversed((*sides, *self.sides)) for path, value in gains[side].items()}
+                | {path: column[corner] for path, column in point.scenarios.columns.items()}
+                for point, gains in rows
+                for corner in range(len(point.scenarios.names))
+            ])  # fmt: skip
+            stage = f"{kind}-{'-'.join(sides)}-{name}"
+            tables = stage_tables(rows[0][0].scenarios.config, stage, self.table, self.held_out_seeds if held_out else None)
+            tables["observer"] = _observer_table(kind, tables["observer"], trials.iloc[0].to_dict())
+            columns = [f"{side}.{metric}" for side in sides for metric in names]
+            metrics = self.stages.run_trials(tables, stage, trials, columns)
+            for side in sides:
+                errors = metrics[f"{side}.{names[0]}"]
+                is_good = np.isfinite(errors)
+                if longest is not None:
+                    is_good &= metrics[f"{side}.convergence_time"] <= longest
+                errors = np.where(is_good, errors, np.inf)
+                errors_by_side[side] = errors.reshape(len(rows), -1, errors.shape[1]).max(axis=1)
         return errors_by_side
 
 
@@ -265,7 +249,7 @@ def _observer_table(kind: str, study_table: Mapping[str, Any], trial: Mapping[st
     return data
 
 
-def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[PointGroup]:
+def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[list[MapPoint]]:
     """Group the points of the map by what is fixed at compile time, with a pilot run for each plant."""
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
     points = Points(config.model_copy(update={"axes": table.axes, "sweep": grid}))
@@ -285,7 +269,7 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
             values = group.structural | lane
             point_values = {axis.path: values[axis.path] for axis in table.axes}
             map_points.append(MapPoint(point_values, lane, scenarios, pilots[key], {}, {}))
-        groups.append(PointGroup(group.config, map_points))
+        groups.append(map_points)
     if stored_pilots != pilots:
         stages.write_manifest(pilots=pilots)
     return groups
@@ -344,21 +328,20 @@ def _summary(search: _KindSearch) -> JsonObject:
     """Return the content of `tuning.json`."""
     config, table, points = search.config, search.table, []
     none = np.full(search.held_out_seeds, np.inf)
-    for group in search.groups:
-        for point in group.points:
-            sides = {}
-            for side in search.sides:
-                ranking = rank_kinds({kind: point.held_out.get(kind, {}).get(side, none) for kind in table.observers})
-                for kind, rank in ranking.items():
-                    rank |= _describe_search(point.searches[kind][side], side)
-                best = next(iter(ranking))
-                sides[side] = {
-                    "best": best if ranking[best]["ratio"] is not None else None,
-                    "not_told_apart": list_ties(ranking),
-                    "f_plus": point.pilot[side]["f_plus"],
-                    "kinds": ranking,
-                }
-            points.append({"values": point.values, "sides": sides})
+    for point in chain.from_iterable(search.groups):
+        sides = {}
+        for side in search.sides:
+            ranking = rank_kinds({kind: point.held_out.get(kind, {}).get(side, none) for kind in table.observers})
+            for kind, rank in ranking.items():
+                rank |= _describe_search(point.searches[kind][side], side)
+            best = next(iter(ranking))
+            sides[side] = {
+                "best": best if ranking[best]["ratio"] is not None else None,
+                "not_told_apart": list_ties(ranking),
+                "f_plus": point.pilot[side]["f_plus"],
+                "kinds": ranking,
+            }
+        points.append({"values": point.values, "sides": sides})
     first = config.sweep.first_seed
     summary = {
         "title": config.title,
@@ -367,7 +350,7 @@ def _summary(search: _KindSearch) -> JsonObject:
         "observers": table.observers,
         "trials": table.trials * (1 + table.refine),
         "seeds": [first, first + search.seeds - 1],
-        "scenarios": search.groups[0].points[0].scenarios.names,
+        "scenarios": search.groups[0][0].scenarios.names,
         "axes": [axis.path for axis in table.axes],
         "holdout": describe_holdout(config, table, search.held_out_seeds),
         "points": points,
@@ -402,7 +385,7 @@ def _for_both_sides(sides: Mapping[str, Any], observers: Sequence[str]) -> str |
 
 def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[str]:
     table, lines = search.table, []
-    names = search.groups[0].points[0].scenarios.names
+    names = search.groups[0][0].scenarios.names
     if table.worst_over_uncertainty:
         drives = "only the nominal drive was run" if len(names) == 1 else f"the worst over {len(names)} drives"
         lines.append(f"tune.worst_over_uncertainty: {drives}: {'; '.join(names)}.")
