@@ -134,7 +134,7 @@ def trace_block(
             {port.name: jax.ShapeDtypeStruct((), port.dtype) for port in ports} for ports in (start_inputs, inputs)
         )
         state = jax.eval_shape(lambda *arguments: start(*arguments)[0], numbers, begin)
-        descriptions: dict[str, list[str]] = {}
+        descriptions: dict[str, tuple[str, str]] = {}
 
         def start_in_order(study_values: Leaves, start_values: Leaves) -> Any:
             state, out = start(_name_values(numbers, study_values), _name_values(begin, start_values))
@@ -142,7 +142,7 @@ def trace_block(
 
         def step_in_order(study_values: Leaves, state: Any, sample_values: Leaves) -> Any:
             new, out = step(_name_values(numbers, study_values), state, _name_values(sample, sample_values))
-            descriptions.update({name: description for name, (_, *description) in out.items()})
+            descriptions.update({name: (unit, description) for name, (_, unit, description) in out.items()})
             return new, [value for value, _, _ in out.values()]
 
         traced_start = trace(start_in_order, [*numbers.values()], [*begin.values()])

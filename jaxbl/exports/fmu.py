@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxbl.config import Config
 from jaxbl.errors import NoResult, escape_unprintable
@@ -24,6 +24,7 @@ from jaxbl.sweeps.store import identity
 from .block import Port
 from .c import c_type, write_c_code
 from .plant import PlantProgram
+from .writer import add_element
 
 FMI = {2: "2.0", 3: "3.0"}
 """Versions by their numbers in options."""
@@ -275,38 +276,38 @@ def _write_description(
     else:
         capabilities |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
         capabilities |= {"canNotUseMemoryManagementFunctions": "true"}
-    simulation = ET.SubElement(root, "CoSimulation", capabilities)
+    simulation = add_element(root, "CoSimulation", **capabilities)
     if fmi == 2:
-        files = ET.SubElement(simulation, "SourceFiles")
+        files = add_element(simulation, "SourceFiles")
         for variable in sources:
-            ET.SubElement(files, "File", name=variable)
-    units = ET.SubElement(root, "UnitDefinitions")
+            add_element(files, "File", name=variable)
+    units = add_element(root, "UnitDefinitions")
     for unit in dict.fromkeys(write_unit(variable.unit) for variable in variables if variable.unit):
-        element = ET.SubElement(units, "Unit", name=unit)
+        element = add_element(units, "Unit", name=unit)
         if (base := find_base_units(unit)) is not None:
-            ET.SubElement(element, "BaseUnit", {key: str(power) for key, power in base.items()})
-    categories = ET.SubElement(root, "LogCategories")
-    ET.SubElement(categories, "Category", name="logStatusError", description="what was refused, and why")
-    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=_write_number(run.duration), stepSize=period)
-    model_variables = ET.SubElement(root, "ModelVariables")
-    structure = ET.SubElement(root, "ModelStructure")
+            add_element(element, "BaseUnit", **base)
+    categories = add_element(root, "LogCategories")
+    add_element(categories, "Category", name="logStatusError", description="what was refused, and why")
+    add_element(root, "DefaultExperiment", startTime="0", stopTime=_write_number(run.duration), stepSize=period)
+    model_variables = add_element(root, "ModelVariables")
+    structure = add_element(root, "ModelStructure")
     # FMI 2 does not need the time, and the FMI Library misses a start value of it
     declared = [(i, variable) for i, variable in enumerate(variables) if fmi == 3 or variable.causality != "independent"]
     for i, variable in declared:
         _write_variable(model_variables, i, variable, fmi)
     for tag, more in (("Output", {"dependencies": ""}), ("InitialUnknown", {})):
-        parent = structure if fmi == 3 else ET.SubElement(structure, f"{tag}s")
+        parent = structure if fmi == 3 else add_element(structure, f"{tag}s")
         for place, (i, variable) in enumerate(declared, 1):
             if variable.causality == "output":
                 element_name, key, number = (tag, "valueReference", i) if fmi == 3 else ("Unknown", "index", place)
-                ET.SubElement(parent, element_name, {key: str(number)} | more)
+                add_element(parent, element_name, **{key: number}, **more)
     return _write_xml(root)
 
 
 def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: int) -> None:
-    attributes = {
+    attributes: dict[str, Any] = {
         "name": variable.name,
-        "valueReference": str(reference),
+        "valueReference": reference,
         "causality": variable.causality,
         "variability": variable.variability,
     }
@@ -320,17 +321,17 @@ def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: i
     limits = {"min": variable.least, "max": variable.most, "start": variable.start}
     number |= {key: _write_number(value) for key, value in limits.items() if value is not None}
     if fmi == 3:
-        ET.SubElement(parent, "Float64", attributes | number)
+        add_element(parent, "Float64", **attributes, **number)
     else:
-        ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes), "Real", number)
+        add_element(add_element(parent, "ScalarVariable", **attributes), "Real", **number)
 
 
 def _write_build_description(name: str, sources: Sequence[str]) -> str:
     root = ET.Element("fmiBuildDescription", fmiVersion=FMI[3])
-    build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    files = ET.SubElement(build, "SourceFileSet", language="C99")
+    build = add_element(root, "BuildConfiguration", modelIdentifier=name)
+    files = add_element(build, "SourceFileSet", language="C99")
     for source in sources:
-        ET.SubElement(files, "SourceFile", name=source)
+        add_element(files, "SourceFile", name=source)
     return _write_xml(root)
 
 

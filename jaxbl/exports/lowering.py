@@ -269,7 +269,9 @@ class _Lowering(ScalarWriter):
         no, yes = (self.lower_body(branch, operands) for branch in branches)
         # what is the same on both ways is no choice
         differ = [not are_same(a, b) for a, b in zip(yes.results, no.results, strict=True)]
-        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)]
+        merged: list[Any] = [
+            self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)
+        ]
         bodies = _select_results(yes, differ), _select_results(no, differ)
         self.statements.append(Choice(condition, tuple(compress(merged, differ)), bodies, source))
         return merged

@@ -6,7 +6,7 @@ dead band is the gear with its gap. :mod:`.to_mujoco` says what an effect or a l
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from jaxbl.chain import Experiment
@@ -18,7 +18,7 @@ from jaxbl.units import on_a_line
 
 from .mujoco_parts import IMPEDANCE, RESOLUTION, Answer, MujocoParts, SideParts, Spring, exactly, unsaid
 from .to_mujoco import to_mujoco
-from .writer import separate
+from .writer import add_element, format_numbers, separate, set_attributes
 
 MUJOCO = "4.0"
 """The version for which models are written."""
@@ -110,7 +110,7 @@ def _describe_numbers(part: Any, slides: bool) -> Iterable[str]:
         value = getattr(part, field.name)
         if value != () and not isinstance(value, bool):
             unit = on_a_line(parameter.unit) if slides else parameter.unit
-            text = _format_numbers(*value) if isinstance(value, tuple) else _format_numbers(value)
+            text = format_numbers(*value) if isinstance(value, tuple) else format_numbers(value)
             yield f"{field.name} = {text} {unit}".rstrip()
 
 
@@ -134,12 +134,12 @@ def _write_model(
         for path, answer in answers.items():
             if answer.fidelity == fidelity:
                 _add_comments(root, f"{heading}: {path}: {answer.text}")
-    _add(root, "compiler", angle="radian", inertiafromgeom="false")
-    _add_comments(root, f"run.sample_period = {_format_numbers(experiment.run.sample_period)} s: {steps} steps")
-    option = _add(root, "option", timestep=step, integrator="RK4", gravity=f"0 0 {-_GRAVITY}")
-    _add(option, "flag", contact="disable")
-    world = _add(root, "worldbody")
-    _add(world, "light", pos="0 -1 2", dir="0 0.5 -1")
+    add_element(root, "compiler", angle="radian", inertiafromgeom="false")
+    _add_comments(root, f"run.sample_period = {format_numbers(experiment.run.sample_period)} s: {steps} steps")
+    option = add_element(root, "option", timestep=step, integrator="RK4", gravity=f"0 0 {-_GRAVITY}")
+    add_element(option, "flag", contact="disable")
+    world = add_element(root, "worldbody")
+    add_element(world, "light", pos="0 -1 2", dir="0 0.5 -1")
     for i, (side, side_parts) in enumerate(parts.sides.items()):
         numbers = _describe_numbers(experiment.drive, side_parts.slides)
         _add_comments(world, *(f"drive.{number}" for number in numbers if number.startswith(side)))
@@ -155,7 +155,7 @@ def _write_model(
 
 def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, step: float) -> None:
     """Add the body of a side, with its joint."""
-    body = _add(world, "body", name=side, pos=(offset, 0, 0))
+    body = add_element(world, "body", name=side, pos=(offset, 0, 0))
     # the inertia of eccentric masses is part of the side's: half of it at most
     arms = [min(_ARM, 0.5 * parts.inertia / len(parts.pendulums) * _GRAVITY / mass.torque) for mass in parts.pendulums]
     round_off = 1e-6 * parts.inertia
@@ -164,32 +164,36 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
     )
     _add_inertia(body, parts.inertia - inertia_of_masses, parts.slides)
     moves = {"type": "slide", "axis": "1 0 0"} if parts.slides else {"type": "hinge", "axis": "0 1 0"}
-    joint = _add(body, "joint", name=side, **moves, damping=(parts.viscous, parts.drag) if parts.drag else parts.viscous)
+    joint = add_element(
+        body, "joint", name=side, **moves, damping=(parts.viscous, parts.drag) if parts.drag else parts.viscous
+    )
     if parts.dry:
         # as hard as the steps allow: MuJoCo's defaults are softer
-        _set(joint, frictionloss=parts.dry, solreffriction=(2.0 * step, 1), solimpfriction=f"{IMPEDANCE} {IMPEDANCE} 0.001")
+        set_attributes(
+            joint, frictionloss=parts.dry, solreffriction=(2.0 * step, 1), solimpfriction=f"{IMPEDANCE} {IMPEDANCE} 0.001"
+        )
     appearance = {"contype": "0", "conaffinity": "0", "rgba": _COLOURS[side]}
     if parts.slides:
-        _add(body, "geom", **appearance, type="box", size="0.06 0.04 0.04")
+        add_element(body, "geom", **appearance, type="box", size="0.06 0.04 0.04")
     else:
-        _add(body, "geom", **appearance, type="cylinder", size="0.08 0.02", euler=(math.pi / 2, 0, 0))
+        add_element(body, "geom", **appearance, type="cylinder", size="0.08 0.02", euler=(math.pi / 2, 0, 0))
         pointer = appearance | {"rgba": "1 1 1 1"}
-        _add(body, "geom", **pointer, type="box", size="0.01 0.022 0.03", pos="0 0 -0.05")
+        add_element(body, "geom", **pointer, type="box", size="0.01 0.022 0.03", pos="0 0 -0.05")
     for i, (mass, arm) in enumerate(zip(parts.pendulums, arms, strict=True)):
         place = arm * math.sin(mass.phase), 0, -arm * math.cos(mass.phase)
-        eccentric = _add(body, "body", name=f"{side}_mass{i}", pos=place)
+        eccentric = add_element(body, "body", name=f"{side}_mass{i}", pos=place)
         _add_inertia(eccentric, round_off, mass=mass.torque / _GRAVITY / arm)
-        _add(eccentric, "geom", **appearance, type="sphere", size=0.02)
+        add_element(eccentric, "geom", **appearance, type="sphere", size=0.02)
     for i, flexible in enumerate(parts.flexible_inertias):
         name = f"{side}_behind_spring{i}"
-        flexible_body = _add(body, "body", name=name)
+        flexible_body = add_element(body, "body", name=name)
         _add_inertia(flexible_body, flexible.inertia, parts.slides)
-        _add(flexible_body, "joint", name=name, **moves, stiffness=flexible.stiffness, damping=flexible.damping)
+        add_element(flexible_body, "joint", name=name, **moves, stiffness=flexible.stiffness, damping=flexible.damping)
 
 
 def _add_inertia(body: ET.Element, inertia: float, slides: bool = False, mass: float = 1.0) -> None:
     """Add an inertia to a body: a mass along a line, a moment about the axis."""
-    _add(body, "inertial", pos="0 0 0", mass=inertia if slides else mass, diaginertia=[inertia] * 3)
+    add_element(body, "inertial", pos="0 0 0", mass=inertia if slides else mass, diaginertia=[inertia] * 3)
 
 
 def _add_tendons(root: ET.Element, parts: MujocoParts, notes: list[str]) -> None:
@@ -198,7 +202,7 @@ def _add_tendons(root: ET.Element, parts: MujocoParts, notes: list[str]) -> None
     springs = [spring._replace(low=spring.low - gap, high=spring.high + gap) for spring in parts.springs]
     if springs:
         _add_comments(
-            tendons, f"The twist z = theta_e - N_0 theta_s, drive.gear_ratio N_0 = {_format_numbers(parts.ratio)}", *notes
+            tendons, f"The twist z = theta_e - N_0 theta_s, drive.gear_ratio N_0 = {format_numbers(parts.ratio)}", *notes
         )
     if parts.damping and gap:
         # the limits are springs with dampers as well, being weak constraints: they act from the gap on, and do not pull
@@ -214,7 +218,7 @@ def _add_tendons(root: ET.Element, parts: MujocoParts, notes: list[str]) -> None
         limits = {"damping": parts.damping}
     for i, spring in enumerate(springs):
         tendon = _add_spring(tendons, f"gear{i}", spring, "motor", **({} if i else limits))
-        _add(tendon, "joint", joint="load", coef=-float(parts.ratio or 0.0))
+        add_element(tendon, "joint", joint="load", coef=-float(parts.ratio or 0.0))
     for side, side_parts in parts.sides.items():
         for i, spring in enumerate(side_parts.springs):
             _add_spring(tendons, f"{side}_spring{i}", spring, side)
@@ -224,44 +228,44 @@ def _add_tendons(root: ET.Element, parts: MujocoParts, notes: list[str]) -> None
 
 def _add_spring(tendons: ET.Element, name: str, spring: Spring, joint: str, **more: Any) -> ET.Element:
     stiffness = (spring.linear, 0, spring.cubic) if spring.cubic else spring.linear
-    tendon = _add(tendons, "fixed", name=name, stiffness=stiffness, springlength=(spring.low, spring.high), **more)
-    _add(tendon, "joint", joint=joint, coef=1)
+    tendon = add_element(tendons, "fixed", name=name, stiffness=stiffness, springlength=(spring.low, spring.high), **more)
+    add_element(tendon, "joint", joint=joint, coef=1)
     return tendon
 
 
 def _add_actuators(root: ET.Element, parts: MujocoParts, notes: list[str], step: float) -> None:
     """Add the input, and passive motors for friction and torques over the position."""
-    actuators, chain = _add(root, "actuator"), parts.actuator
+    actuators, chain = add_element(root, "actuator"), parts.actuator
     _add_comments(actuators, "The input u, held from sample to sample", *notes)
-    driven = _add(actuators, "general", name="input", joint="motor", gainprm=chain.gain)
+    driven = add_element(actuators, "general", name="input", joint="motor", gainprm=chain.gain)
     if chain.lag is not None:
-        _set(driven, dyntype="filterexact", dynprm=chain.lag)
+        set_attributes(driven, dyntype="filterexact", dynprm=chain.lag)
     for name, limit in (("ctrl", chain.limit), ("force", chain.torque_limit)):
         if math.isfinite(limit):
-            _set(driven, **{f"{name}range": (-limit, limit), f"{name}limited": "true"})
+            set_attributes(driven, **{f"{name}range": (-limit, limit), f"{name}limited": "true"})
     if chain.delay:
-        _set(driven, delay=chain.delay, nsample=math.ceil(chain.delay / step) + 2)
+        set_attributes(driven, delay=chain.delay, nsample=math.ceil(chain.delay / step) + 2)
     for side, side_parts in parts.sides.items():
         passive = {"joint": side, "input": "none", "motorconst": "0", "resistance": "1"}
         for i, wave in enumerate(side_parts.waves):
-            _add(actuators, "dcmotor", **passive, name=f"{side}_wave{i}", cogging=wave)
+            add_element(actuators, "dcmotor", **passive, name=f"{side}_wave{i}", cogging=wave)
         for i, bristles in enumerate(side_parts.bristles):
-            _add(actuators, "dcmotor", **passive, name=f"{side}_friction{i}", lugre=bristles)
+            add_element(actuators, "dcmotor", **passive, name=f"{side}_friction{i}", lugre=bristles)
 
 
 def _add_sensors(root: ET.Element, parts: MujocoParts) -> None:
-    sensors = _add(root, "sensor")
+    sensors = add_element(root, "sensor")
     for side in parts.sides:
-        _add(sensors, "jointpos", name=f"{side}_position", joint=side)
-        _add(sensors, "jointvel", name=f"{side}_velocity", joint=side)
+        add_element(sensors, "jointpos", name=f"{side}_position", joint=side)
+        add_element(sensors, "jointvel", name=f"{side}_velocity", joint=side)
     if parts.ratio is not None:
-        _add(sensors, "tendonpos", name="twist", tendon="gear0")
-    _add(sensors, "actuatorfrc", name="motor_torque", actuator="input")
+        add_element(sensors, "tendonpos", name="twist", tendon="gear0")
+    add_element(sensors, "actuatorfrc", name="motor_torque", actuator="input")
 
 
 def _add_keyframe(root: ET.Element, experiment: Experiment, parts: MujocoParts) -> None:
     """Add the state at t = 0."""
-    keyframe, positions, velocities = _add(root, "keyframe"), [], []
+    keyframe, positions, velocities = add_element(root, "keyframe"), [], []
     for side, side_parts in parts.sides.items():
         position, velocity = (getattr(experiment.initial, f"{side}_{name}") for name in ("position", "velocity"))
         # what is behind a spring stands still: its joint's velocity is that against the side
@@ -269,28 +273,10 @@ def _add_keyframe(root: ET.Element, experiment: Experiment, parts: MujocoParts) 
         positions += [position, *[0] * count]
         velocities += [velocity, *[-velocity] * count]
     _add_comments(keyframe, "initial.*: the state at t = 0")
-    _add(keyframe, "key", name="initial", qpos=positions, qvel=velocities)
-
-
-def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
-    """Add an element with attributes: texts, a number, or several numbers."""
-    element = ET.SubElement(parent, tag)
-    _set(element, **attributes)
-    return element
-
-
-def _set(element: ET.Element, **attributes: Any) -> None:
-    for name, value in attributes.items():
-        several = value if isinstance(value, Sequence) else [value]
-        element.set(name, value if isinstance(value, str) else _format_numbers(*several))
+    add_element(keyframe, "key", name="initial", qpos=positions, qvel=velocities)
 
 
 def _add_comments(parent: ET.Element, *texts: str) -> None:
     for text in texts:
         # two dashes end a comment
         parent.append(ET.Comment(f" {separate(text, '--')} "))
-
-
-def _format_numbers(*values: Any) -> str:
-    """Write numbers with all their digits, with spaces between them."""
-    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)

@@ -3,6 +3,7 @@
 import abc
 import re
 import textwrap
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from itertools import chain, count
 from typing import Any
@@ -51,8 +52,8 @@ class Writer(abc.ABC):
         block = program.block
         self._used = {quantity.name.lower() for quantity in (*block.start_inputs, *block.inputs, *block.outputs)}
         self._numbers = count(1)
-        constants = [quantity for routine in (program.start, program.step) for quantity in find_constants(routine)]
-        self.constants = name_constants(dict.fromkeys(constants), program.block.study_numbers)
+        constants = [*find_constants(program.start), *find_constants(program.step)]
+        self.constants = name_constants(dict.fromkeys(constants), block.study_numbers)
 
     # what a language says
 
@@ -205,3 +206,22 @@ def write_comment(marks: tuple[str, str], *lines: str) -> str:
     plain_lines = (line.translate(_LETTERS).encode("ascii", "replace").decode() for line in lines)
     texts = (f"   {separate(line, *_COMMENT_MARKS)}".rstrip() for line in plain_lines)
     return f"{begin}{chr(10).join(texts)[2:]} {end}"
+
+
+def add_element(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
+    """Add an XML element with attributes: texts, a number, or several numbers."""
+    element = ET.SubElement(parent, tag)
+    set_attributes(element, **attributes)
+    return element
+
+
+def set_attributes(element: ET.Element, **attributes: Any) -> None:
+    """Set attributes of an XML element: texts, a number, or several numbers."""
+    for name, value in attributes.items():
+        numbers = value if isinstance(value, Sequence) else [value]
+        element.set(name, value if isinstance(value, str) else format_numbers(*numbers))
+
+
+def format_numbers(*values: Any) -> str:
+    """Write numbers with all their digits, with spaces between them."""
+    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)

@@ -107,8 +107,7 @@ def _search_gains(config: Config, table: TuneTable, scenarios: Scenarios, stages
         stages.write_manifest(pilot=search.pilot)
     search.run()
     passed_over = {} if table.certificate is None else choose_certified_gains(search)
-    named_rows, held_out_rows = (search.compare_gains(held_out=held_out) for held_out in (False, True))
-    summary = Summary(search, named_rows, held_out_rows, search.split_error()).to_dict()
+    summary = Summary(search).to_dict()
     if table.certificate is not None:
         summary["certificates"] = certify_best_gains(search, stages.path_of("certificate.json"))
         summary["passed_over"] = passed_over

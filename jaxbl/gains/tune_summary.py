@@ -26,30 +26,20 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
 
 
 class Summary:
-    """The summary of a finished search.
+    """The summary of a finished search, with runs of the named gains and of the causes of the error."""
 
-    Args:
-        search: the finished search.
-        named_rows: the named gains on the study's own runs: rows of :func:`.gain_search.summarise_runs`.
-        held_out_rows: the same on the held-out runs.
-        causes: shares of the mean square error (:meth:`.gain_search.GainSearch.split_error`).
-    """
-
-    def __init__(
-        self,
-        search: GainSearch,
-        named_rows: list[JsonObject],
-        held_out_rows: list[JsonObject],
-        causes: dict[str, dict[str, float]],
-    ):
+    def __init__(self, search: GainSearch):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
+        self.named_rows, self.held_out_rows = (search.compare_gains(held_out=held_out) for held_out in (False, True))
+        self.causes = search.split_error()
         self.best_candidates = {side: search.best_candidate(side) for side in search.sides}
         self.conditions = {
             side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best_candidates.items()
         }
         self.limits = {side: find_limits(search, side) for side in search.sides}
-        self.named_rows, self.held_out_rows, self.causes = named_rows, held_out_rows, causes
-        self.held_out = {side: {row["name"]: row for row in held_out_rows if row["side"] == side} for side in search.sides}
+        self.held_out = {
+            side: {row["name"]: row for row in self.held_out_rows if row["side"] == side} for side in search.sides
+        }
         self.factors = {side: self._compare_with_tuned(side) for side in search.sides}
 
     def to_dict(self) -> JsonObject:
