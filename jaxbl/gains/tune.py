@@ -35,6 +35,10 @@ class Tuning(GainChoice):
     """Tuned gains, and the candidates of their search.
 
     Attributes:
+        config: the study.
+        summary: plain data, as in `tuning.json`.
+        cost: seconds of compilation and of computing, and lanes computed in this call.
+        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
         candidates: for each side, one row for each pair of gains tried: `stage` (0 is the coarse map), `lambda`, `alpha`,
             `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, largest `velocity_rmse`,
             `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
