@@ -1,6 +1,7 @@
 """A block to write code for: a state, a step from sample to sample, and names for all inputs and outputs."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import compress
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from .lowering import (
     are_same,
     default_precision,
     drop_unread,
+    drop_unread_turns,
     lower_to_operations,
 )
 
@@ -71,9 +73,8 @@ class Block(NamedTuple):
         start_inputs: further arguments of `start`.
         state: numbers that are carried from sample to sample.
         inputs, outputs: of each sample.
-        start: study numbers, start inputs -> state, and the outputs before the first step if `start_gives_outputs`.
+        start: study numbers, start inputs -> state, and the outputs before the first step if they are asked for.
         step: study numbers, state, inputs -> state, outputs.
-        start_gives_outputs: True if `start` gives outputs, too.
         references: of positions that may all move by a step, without a change of what else there is.
     """
 
@@ -86,7 +87,6 @@ class Block(NamedTuple):
     outputs: Sequence[Port]
     start: ClosedJaxpr
     step: ClosedJaxpr
-    start_gives_outputs: bool = False
     references: Sequence[Reference] = ()
 
 
@@ -117,73 +117,49 @@ def trace_block(
     study_numbers: Mapping[str, StudyNumber],
     start_inputs: Sequence[Port],
     inputs: Sequence[Port],
-    start: Callable[[Values, Values], Any],
+    start: Callable[[Values, Values], tuple[Any, Outputs]],
     step: Callable[[Values, Any, Values], tuple[Any, Outputs]],
-    outputs: Callable[[Values, Any, Values], Values] | None = None,
 ) -> Block:
     """Trace the functions of a block.
 
     Args:
         name, dtype, study_numbers, start_inputs, inputs: as of :class:`Block`.
-        start: from the numbers of the study by config path, and what it is given by name, to a pytree of scalars.
+        start: from the numbers of the study by config path, and what it is given by name, to the state, a pytree of
+            scalars, and the outputs before the first step, if they are asked for.
         step: the same with the state, to the new state and the outputs: value, unit and description by name.
-        outputs: values of the same outputs before the first step, where they are asked for: from what `start` is given, and
-            the state that it gives.
     """
     with default_precision(dtype):
-        numbers = {path: jax.ShapeDtypeStruct((), dtype) for path in study_numbers}
-        start_avals, sample_avals = (
-            {quantity.name: jax.ShapeDtypeStruct((), quantity.dtype) for quantity in quantities}
-            for quantities in (start_inputs, inputs)
+        numbers = dict.fromkeys(study_numbers, jax.ShapeDtypeStruct((), dtype))
+        begin, sample = (
+            {port.name: jax.ShapeDtypeStruct((), port.dtype) for port in ports} for ports in (start_inputs, inputs)
         )
-        state = jax.eval_shape(start, numbers, start_avals)
-        output_descriptions: dict[str, tuple[str, str]] = {}
+        state = jax.eval_shape(lambda *arguments: start(*arguments)[0], numbers, begin)
+        descriptions: dict[str, tuple[str, str]] = {}
 
-        def flat_start(numbers: Leaves, begin: Leaves) -> Leaves:
-            study_values, start_values = dict(zip(study_numbers, numbers, strict=True)), _name_values(start_inputs, begin)
-            state = start(study_values, start_values)
-            return [*jax.tree.leaves(state), *(outputs(study_values, state, start_values).values() if outputs else ())]
+        def start_in_order(study_values: Leaves, start_values: Leaves) -> Any:
+            state, out = start(_name_values(numbers, study_values), _name_values(begin, start_values))
+            return state, [value for value, _, _ in out.values()]
 
-        def flat_step(numbers: Leaves, leaves: Leaves, sample: Leaves) -> Leaves:
-            tree = jax.tree.structure(state).unflatten(leaves)
-            new, out = step(dict(zip(study_numbers, numbers, strict=True)), tree, _name_values(inputs, sample))
-            output_descriptions.update({name: (unit, description) for name, (_, unit, description) in out.items()})
-            return [*jax.tree.leaves(new), *(value for value, _, _ in out.values())]
+        def step_in_order(study_values: Leaves, state: Any, sample_values: Leaves) -> Any:
+            new, out = step(_name_values(numbers, study_values), state, _name_values(sample, sample_values))
+            descriptions.update({name: (unit, description) for name, (_, unit, description) in out.items()})
+            return new, [value for value, _, _ in out.values()]
 
-        leaves = jax.tree.leaves(state)
-        traced_start = trace(flat_start, list(numbers.values()), list(start_avals.values()))
-        traced_step = trace(flat_step, list(numbers.values()), leaves, list(sample_avals.values()))
-    dtypes = [np.dtype(aval.dtype) for aval in traced_step.out_avals]
-    output_quantities = [
-        Port(name, *output_descriptions[name], dtype)
-        for name, dtype in zip(output_descriptions, dtypes[len(leaves) :], strict=True)
+        traced_start = trace(start_in_order, [*numbers.values()], [*begin.values()])
+        traced_step = trace(step_in_order, [*numbers.values()], state, [*sample.values()])
+    dtypes = (np.dtype(aval.dtype) for aval in traced_step.out_avals)
+    state_ports = [
+        Port(jax.tree_util.keystr(path, simple=True, separator="_"), "", "", next(dtypes))
+        for path, _ in jax.tree.leaves_with_path(state)
     ]
-    leaf_names = [_name_leaf(path) for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]]
-    state_quantities = [
-        Port(quantity, "", "", dtype) for quantity, dtype in zip(leaf_names, dtypes[: len(leaves)], strict=True)
+    outputs = [
+        Port(output, *description, dtype) for (output, description), dtype in zip(descriptions.items(), dtypes, strict=True)
     ]
-    return Block(
-        name,
-        dtype,
-        study_numbers,
-        start_inputs,
-        state_quantities,
-        inputs,
-        output_quantities,
-        traced_start,
-        traced_step,
-        outputs is not None,
-    )
+    return Block(name, dtype, study_numbers, start_inputs, state_ports, inputs, outputs, traced_start, traced_step)
 
 
-def _name_values(quantities: Sequence[Port], values: Sequence[Any]) -> Values:
-    return {quantity.name: value for quantity, value in zip(quantities, values, strict=True)}
-
-
-def _name_leaf(path: Sequence[Any]) -> str:
-    """Name a leaf of the state by its path: `observer_motor_position`."""
-    parts = (getattr(key, "name", None) or getattr(key, "key", None) or getattr(key, "idx", None) for key in path)
-    return "_".join(str(0 if part is None else part) for part in parts)
+def _name_values(names: Iterable[str], values: Sequence[Any]) -> Values:
+    return dict(zip(names, values, strict=True))
 
 
 def lower_block(block: Block) -> Program:
@@ -208,27 +184,20 @@ def lower_block(block: Block) -> Program:
                 break
             constant_states = unchanged_states
     count = len(state)
-    outputs, read_states = step.results[count:], set[int]()
-    while True:
-        needed = Routine(step.statements, (*(step.results[i] for i in sorted(read_states)), *outputs))
-        needed, read = drop_unread(needed)
-        states_read_now = {i for i, variable in enumerate(state) if variable in read and i not in constant_states}
-        if states_read_now == read_states:
-            break
-        read_states = states_read_now
-    kept_indices = sorted(read_states)
-    start_results = *(start_routine.results[i] for i in kept_indices), *start_routine.results[count:]
+    outputs = step.results[count:]
+    needed, _, alive = drop_unread_turns(step, [*state, *[None] * len(outputs)], [False] * count + [True] * len(outputs))
+    start_results = *compress(start_routine.results[:count], alive), *start_routine.results[count:]
     return Program(
         block,
-        tuple(block.state[i] for i in kept_indices),
+        tuple(compress(block.state, alive)),
         drop_unread(Routine(start_routine.statements, start_results))[0],
         needed,
-        tuple(state[i] for i in kept_indices),
+        tuple(compress(state, alive)),
     )
 
 
 def _make_variables(quantities: Sequence[Port]) -> list[Variable]:
-    return [Variable(quantity.dtype, -1, quantity.name) for quantity in quantities]
+    return [Variable(quantity.dtype, quantity.name) for quantity in quantities]
 
 
 _WHOLE = 1.5 * 2.0**52
@@ -262,11 +231,11 @@ def _count_from_references(
 ) -> tuple[Routine, tuple[Variable, ...]]:
     """Return a routine that first moves the references from `origins`, and the variables of all states that it reads."""
     references, double, flag = program.block.references, np.dtype(float), np.dtype(bool)
-    outer = {name: Variable(double, -1, name) for origin in references for name in origin.inputs}
+    outer = {name: Variable(double, name) for origin in references for name in origin.inputs}
     new_states = list(states)
 
     def add(statements: list[Any], name: str, *operands: Any, out: Variable | None = None, dtype: Any = double) -> Variable:
-        out = out or Variable(dtype, -1)
+        out = out or Variable(dtype)
         values = (
             value if isinstance(value, Variable | Constant) else Constant(np.asarray(value, double)) for value in operands
         )
@@ -285,20 +254,23 @@ def _count_from_references(
     outs: dict[Variable, tuple[Any, Any]] = {}
     places: dict[str, Variable] = {}
     for reference, origin in zip(references, origins, strict=True):
-        way, place = add(moves, "mul", steps, reference.step), Variable(double, -1)
+        way, place = add(moves, "mul", steps, reference.step), Variable(double)
         outs[place] = add(moves, "add", origin, way), origin
         places |= dict.fromkeys(reference.inputs, place)
         for i, variable in enumerate(states):
             if program.state[i].name in reference.states:
-                new_states[i] = _free_name(variable)
+                # the variable becomes a numbered one
+                new_states[i], variable.name = Variable(variable.dtype, variable.name), ""
                 near = add(moves, "sub", add(moves, "convert", new_states[i]), way)
                 outs[variable] = add(moves, "convert", near, dtype=variable.dtype), new_states[i]
     yes, no = zip(*outs.values(), strict=True)
     before.append(Choice(far, tuple(outs), (Routine(tuple(moves), yes), Routine((), no)), ""))
-    for variable in drop_unread(routine)[1]:
-        if variable.name in places:
-            name = _free_name(variable).name
-            add(before, "convert", add(before, "sub", outer[name], places[name]), out=variable)
+    variables = {variable.name: variable for variable in drop_unread(routine)[1]}
+    # in the order of the block: that of a set is another one in each process
+    for name, place in places.items():
+        if variable := variables.get(name):
+            variable.name = ""
+            add(before, "convert", add(before, "sub", outer[name], place), out=variable)
     count = len(program.state)
     outputs = list(routine.results[count:])
     for i, port in enumerate(program.block.outputs[: len(outputs)]):
@@ -307,9 +279,3 @@ def _count_from_references(
     results = *routine.results[:count], *(places[reference.inputs[0]] for reference in references), *outputs
     full = Routine((*before, *routine.statements, *after), results)
     return drop_unread(full)[0], (*new_states, *(origin for origin in origins if isinstance(origin, Variable)))
-
-
-def _free_name(variable: Variable) -> Variable:
-    """Return a variable that has the name of another one, which becomes a numbered one."""
-    named, variable.name = Variable(variable.dtype, -1, variable.name), ""
-    return named

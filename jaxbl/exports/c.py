@@ -8,20 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from .block import Port, Program, describe_number
-from .lowering import Constant, Operation, Value, Variable, find_constants
+from .lowering import Constant, Operation, Routine, Value, Variable, find_constants
 from .writer import Writer, find_unread_names, write_comment, write_shortest
 
-_TYPES = {
-    "float64": "double",
-    "float32": "float",
-    "int32": "int32_t",
-    "uint32": "uint32_t",
-    "int64": "int64_t",
-    "uint64": "uint64_t",
-    "bool": "bool",
-}
+_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 C_MARKS = "/*", "*/"
-_WIDTH = 110
 
 
 class Code(NamedTuple):
@@ -33,7 +24,7 @@ class Code(NamedTuple):
 
 def c_type(dtype: np.dtype) -> str:
     """Return the C type for numbers of a dtype."""
-    return _TYPES[str(dtype)]
+    return _TYPES.get(str(dtype), f"{dtype}_t")
 
 
 def write_c_code(program: Program, head_lines: Sequence[str]) -> Code:
@@ -47,7 +38,7 @@ def write_c_code(program: Program, head_lines: Sequence[str]) -> Code:
     writer = _C(program)
     writer.write_routines()
     head = write_comment(C_MARKS, *head_lines)
-    constants = writer.define_constants(set.intersection(*writer.constants_read))
+    constants = writer.define_constants(writer.shared_constants)
     includes = [f'#include "{name}.h"', "", *(["#include <math.h>", ""] if writer.needs_math else [])]
     parts = [head, "", *includes, *constants, "" if constants else None, *writer.write_helpers(), *writer.lines]
     source = "\n".join(part for part in parts if part is not None)
@@ -98,7 +89,7 @@ def write_signatures(program: Program) -> tuple[str, str]:
         for quantities in (block.start_inputs, block.inputs)
     )
     outputs = f"{name}_outputs *outputs"
-    start = ", ".join([f"{name}_state *state", *first, *([outputs] if block.start_gives_outputs else [])])
+    start = ", ".join([f"{name}_state *state", *first, *[outputs] * (len(program.start.results) > len(program.state))])
     step = ", ".join([f"{name}_state *state", *inputs, outputs])
     return f"void {name}_init({start})", f"void {name}_step({step})"
 
@@ -112,43 +103,37 @@ def _write_struct(name: str, members: Sequence[Port]) -> list[str]:
 
 
 class _C(Writer):
-    marks = C_MARKS
+    marks, assignment = C_MARKS, "="
+    choice, otherwise = "if (%s)\n{", "}\nelse\n{"
+    end_choice = end_repeat = "}"
 
     def __init__(self, program: Program):
         super().__init__(program)
         self.needs_math = False
         self._helper_types: dict[str, tuple[np.dtype, ...]] = {}
         """Argument and result type of each helper function that the code calls, by its name."""
-        self.constants_read = [
-            set(find_constants(routine)) & self.constants.keys() for routine in (program.start, program.step)
-        ]
-        """Named constants of init and of step."""
+        self.shared_constants = set(find_constants(program.start)).intersection(find_constants(program.step))
 
     def write_routines(self) -> None:
         """Write init and step."""
         program, block = self.program, self.program.block
         start, step = write_signatures(program)
-        self._write_function(start, 0, block.start_inputs, ())
+        self._write_function(start, program.start, block.start_inputs, ())
         self.add_lines("")
-        self._write_function(step, 1, block.inputs, program.state_variables)
+        self._write_function(step, program.step, block.inputs, program.state_variables)
 
     def _write_function(
-        self,
-        head: str,
-        routine_index: int,
-        arguments: Sequence[Port],
-        state_variables: Sequence[Variable],
+        self, head: str, routine: Routine, arguments: Sequence[Port], state_variables: Sequence[Variable]
     ) -> None:
         """One of the two; `state_variables` are variables for the state that it finds."""
         program, block = self.program, self.program.block
-        routine = (program.start, program.step)[routine_index]
         self.add_lines(head, "{")
         self._depth += 1
         # constants that only this routine reads
-        definitions = self.define_constants(self.constants_read[routine_index] - self.constants_read[1 - routine_index])
+        definitions = self.define_constants(set(find_constants(routine)) - self.shared_constants)
         self.add_lines(*definitions, *([""] if definitions else []))
         self.add_lines(*(f"(void){name};" for name in find_unread_names(routine, arguments)))
-        for quantity, variable in zip(program.state, state_variables, strict=routine_index == 1):
+        for quantity, variable in zip(program.state, state_variables, strict=False):
             self.give_name(variable, f"old_{quantity.name}")
             self.define(variable, f"state->{quantity.name}")
         self.add_lines("")
@@ -196,21 +181,9 @@ class _C(Writer):
         zero = self.literal(Constant(np.asarray(0, out.dtype)))
         self.add_lines(f"{c_type(out.dtype)} {self.name(out)} = {text or zero};")
 
-    def assign(self, name, text):
-        self.add_lines(f"{name} = {text};")
-
     def begin_repeat(self, times):
         index = self.make_unique("i")
         self.add_lines(f"for (uint32_t {index} = 0u; {index} < {times}u; {index}++)", "{")
-
-    def begin_if(self, condition):
-        self.add_lines(f"if ({condition})", "{")
-
-    def begin_else(self):
-        self.add_lines("}", "else", "{")
-
-    def end(self, statement):
-        self.add_lines("}")
 
     def write_operation(self, operation):
         self.define(operation.out, self._write_expression(operation))

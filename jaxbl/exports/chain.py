@@ -64,14 +64,14 @@ def build_observer_chain(config: Config, name: str, dtype: np.dtype) -> Block:
         owner = f"that the {experiment.controller.side} is to have"
         targets = [Port(f"target_{name}", unit, f"{name} {owner}", dtype) for name, unit in units]
 
-    def start(numbers: Values, inputs: Values) -> _ChainState:
+    def start(numbers: Values, inputs: Values) -> tuple[_ChainState, Outputs]:
         readings = {side: inputs[f"{side}_position"] for side in sides}
         measured = {side: jnp.where(jnp.isfinite(reading), reading, 0.0) for side, reading in readings.items()}
         zero, lane = jnp.zeros((), jnp.int32), set_leaves(experiment, numbers)
         state = vars(initial_state(lane, measured))
         if lane.controller is not None:
             state |= {"controller": lane.controller.start(measured)}
-        return _ChainState(**state, samples=zero, missed=dict.fromkeys(sides, zero))
+        return _ChainState(**state, samples=zero, missed=dict.fromkeys(sides, zero)), {}
 
     def sample(numbers: Values, state: _ChainState, inputs: Values) -> tuple[_ChainState, Outputs]:
         lane = set_leaves(experiment, numbers)

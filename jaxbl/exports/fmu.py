@@ -15,15 +15,16 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxbl.config import Config
-from jaxbl.errors import escape_unprintable
+from jaxbl.errors import NoResult, escape_unprintable
 from jaxbl.sweeps.store import identity
 
 from .block import Port
 from .c import c_type, write_c_code
 from .plant import PlantProgram
+from .writer import add_element
 
 FMI = {2: "2.0", 3: "3.0"}
 """Versions by their numbers in options."""
@@ -149,19 +150,18 @@ def _compile_binaries(name: str, fmi: int, sources: Mapping[str, str]) -> tuple[
         if target is None or folder is None:
             missing.append(f"for {' on '.join(system)} none is compiled in FMI {FMI[fmi]}")
             continue
-        content, fault = _compile_binary(name, target, sources)
-        if fault:
-            missing.append(fault)
-        else:
-            binaries[folder] = f"{name}.{target.ending}", content
+        try:
+            binaries[folder] = f"{name}.{target.ending}", _compile_binary(name, target, sources)
+        except NoResult as error:
+            missing.append(str(error))
     return binaries, missing
 
 
-def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> tuple[bytes, str]:
-    """Compile the sources for a platform. Returns the binary, or b"" and the reason why there is none."""
+def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> bytes:
+    """Compile the sources for a platform. Raises `NoResult` with the reason why there is no binary."""
     compiler = shutil.which(target.compiler)
     if compiler is None:
-        return b"", f"no C compiler ({target.compiler}) was found"
+        raise NoResult(f"no C compiler ({target.compiler}) was found")
     with TemporaryDirectory() as folder:
         for file, text in sources.items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
@@ -177,11 +177,11 @@ def _compile_binary(name: str, target: Platform, sources: Mapping[str, str]) -> 
                 timeout=_LONGEST_COMPILATION,
             )
         except (OSError, subprocess.TimeoutExpired) as error:
-            return b"", f"{compiler} did not run ({error})"
+            raise NoResult(f"{compiler} did not run ({error})") from None
         if process.returncode:
             errors = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
-            return b"", f"{compiler} failed: {errors[0]}"
-        return (Path(folder) / library).read_bytes(), ""
+            raise NoResult(f"{compiler} failed: {errors[0]}")
+        return (Path(folder) / library).read_bytes()
 
 
 # variables
@@ -204,7 +204,8 @@ def _list_variables(plant: PlantProgram) -> list[Scalar]:
         minimum = parameter.minimum if parameter.above is None else parameter.above
         variables.append(
             Scalar(
-                _to_structured_name(path),
+                # by FMI's "structured" naming convention
+                re.sub(r"\.(\d+)(?=\.)", r"[\1]", path),
                 "parameter",
                 kind,
                 parameter.unit,
@@ -218,11 +219,6 @@ def _list_variables(plant: PlantProgram) -> list[Scalar]:
     return variables
 
 
-def _to_structured_name(path: str) -> str:
-    """Write a config path by FMI's "structured" naming convention: `effects.0.torque` becomes `effects[0].torque`."""
-    return re.sub(r"\.(\d+)(?=\.)", r"[\1]", path)
-
-
 _BASES: dict[str, dict[str, int]] = {
     **{base: {base: 1} for base in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")},
     "N": {"kg": 1, "m": 1, "s": -2},
@@ -231,14 +227,12 @@ _BASES: dict[str, dict[str, int]] = {
     "Hz": {"s": -1},
 }
 """Exponents of base units."""
-_POWERS = {"²": "2", "³": "3", "^": "", " ": "."}
+_POWERS = str.maketrans({"²": "2", "³": "3", "^": "", " ": "."})
 
 
 def write_unit(unit: str) -> str:
     """Write a unit as FMI tools do: `N.m.s2/rad2`."""
-    for letter, other in _POWERS.items():
-        unit = unit.replace(letter, other)
-    return unit
+    return unit.translate(_POWERS)
 
 
 def find_base_units(unit: str) -> dict[str, int] | None:
@@ -282,38 +276,38 @@ def _write_description(
     else:
         capabilities |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
         capabilities |= {"canNotUseMemoryManagementFunctions": "true"}
-    simulation = ET.SubElement(root, "CoSimulation", capabilities)
+    simulation = add_element(root, "CoSimulation", **capabilities)
     if fmi == 2:
-        files = ET.SubElement(simulation, "SourceFiles")
+        files = add_element(simulation, "SourceFiles")
         for variable in sources:
-            ET.SubElement(files, "File", name=variable)
-    units = ET.SubElement(root, "UnitDefinitions")
+            add_element(files, "File", name=variable)
+    units = add_element(root, "UnitDefinitions")
     for unit in dict.fromkeys(write_unit(variable.unit) for variable in variables if variable.unit):
-        element = ET.SubElement(units, "Unit", name=unit)
+        element = add_element(units, "Unit", name=unit)
         if (base := find_base_units(unit)) is not None:
-            ET.SubElement(element, "BaseUnit", {key: str(power) for key, power in base.items()})
-    categories = ET.SubElement(root, "LogCategories")
-    ET.SubElement(categories, "Category", name="logStatusError", description="what was refused, and why")
-    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=_write_number(run.duration), stepSize=period)
-    model_variables = ET.SubElement(root, "ModelVariables")
-    structure = ET.SubElement(root, "ModelStructure")
+            add_element(element, "BaseUnit", **base)
+    categories = add_element(root, "LogCategories")
+    add_element(categories, "Category", name="logStatusError", description="what was refused, and why")
+    add_element(root, "DefaultExperiment", startTime="0", stopTime=_write_number(run.duration), stepSize=period)
+    model_variables = add_element(root, "ModelVariables")
+    structure = add_element(root, "ModelStructure")
     # FMI 2 does not need the time, and the FMI Library misses a start value of it
     declared = [(i, variable) for i, variable in enumerate(variables) if fmi == 3 or variable.causality != "independent"]
     for i, variable in declared:
         _write_variable(model_variables, i, variable, fmi)
     for tag, more in (("Output", {"dependencies": ""}), ("InitialUnknown", {})):
-        parent = structure if fmi == 3 else ET.SubElement(structure, f"{tag}s")
+        parent = structure if fmi == 3 else add_element(structure, f"{tag}s")
         for place, (i, variable) in enumerate(declared, 1):
             if variable.causality == "output":
                 element_name, key, number = (tag, "valueReference", i) if fmi == 3 else ("Unknown", "index", place)
-                ET.SubElement(parent, element_name, {key: str(number)} | more)
+                add_element(parent, element_name, **{key: number}, **more)
     return _write_xml(root)
 
 
 def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: int) -> None:
-    attributes = {
+    attributes: dict[str, Any] = {
         "name": variable.name,
-        "valueReference": str(reference),
+        "valueReference": reference,
         "causality": variable.causality,
         "variability": variable.variability,
     }
@@ -321,25 +315,23 @@ def _write_variable(parent: ET.Element, reference: int, variable: Scalar, fmi: i
         attributes["initial"] = "exact"
     elif variable.causality != "independent" and variable.start is None:
         attributes["initial"] = "calculated"
+    if variable.about:
+        attributes["description"] = variable.about
     number = {"unit": write_unit(variable.unit)} if variable.unit else {}
-    number |= {
-        key: _write_number(value)
-        for key, value in (("min", variable.least), ("max", variable.most), ("start", variable.start))
-        if value is not None
-    }
-    text = {"description": variable.about} if variable.about else {}
+    limits = {"min": variable.least, "max": variable.most, "start": variable.start}
+    number |= {key: _write_number(value) for key, value in limits.items() if value is not None}
     if fmi == 3:
-        ET.SubElement(parent, "Float64", attributes | text | number)
+        add_element(parent, "Float64", **attributes, **number)
     else:
-        ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes | text), "Real", number)
+        add_element(add_element(parent, "ScalarVariable", **attributes), "Real", **number)
 
 
 def _write_build_description(name: str, sources: Sequence[str]) -> str:
     root = ET.Element("fmiBuildDescription", fmiVersion=FMI[3])
-    build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    files = ET.SubElement(build, "SourceFileSet", language="C99")
+    build = add_element(root, "BuildConfiguration", modelIdentifier=name)
+    files = add_element(build, "SourceFileSet", language="C99")
     for source in sources:
-        ET.SubElement(files, "SourceFile", name=source)
+        add_element(files, "SourceFile", name=source)
     return _write_xml(root)
 
 
@@ -359,7 +351,9 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
     name, real = block.name, c_type(block.dtype)
     double = "" if real == "double" else "(double)"
     single = "" if real == "double" else "(float)"
-    reference = {variable.name: i for i, variable in enumerate(variables)}
+    # the names in code, in the order of `variables`
+    names = "time", block.inputs[0].name, *(port.name for port in block.outputs), *plant.parameters
+    reference = {name: i for i, name in enumerate(names)}
     change_rules = {"input": "ALWAYS", "fixed": "FIXED", "tunable": "ALWAYS"}
     rows = []
     for variable in variables:
@@ -372,18 +366,15 @@ def _write_model_header(plant: PlantProgram, variables: Sequence[Scalar], token:
         rows.append(f'    {{"{variable.name}", {change_rule}, {start}, {low}, {high}, {is_open}}},')
 
     def write_arguments(quantities: Sequence[Port]) -> str:
-        places = (
-            reference[_to_structured_name(plant.parameters.get(quantity.name, quantity.name))] for quantity in quantities
-        )
-        arguments = ["&model->state", *(f"{single}model->values[{i}]" for i in places), "&outputs"]
+        values = (f"{single}model->values[{reference[quantity.name]}]" for quantity in quantities)
+        arguments = ["&model->state", *values, "&outputs"]
         # four a line
         return ",\n        ".join(", ".join(arguments[i : i + 4]) for i in range(0, len(arguments), 4))
 
     start_arguments, step_arguments = map(write_arguments, (block.start_inputs, block.inputs))
 
     outputs = [
-        f"    model->values[{reference[plant.outputs[variable.name]]}] = {double}outputs.{variable.name};"
-        for variable in block.outputs
+        f"    model->values[{reference[variable.name]}] = {double}outputs.{variable.name};" for variable in block.outputs
     ]
     longest_name = max(len(variable.name) for variable in variables)
     row_lines, output_lines = "\n".join(rows), "\n".join(outputs)

@@ -9,7 +9,7 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, count
+from itertools import chain, compress
 from typing import Any, NamedTuple, TypeGuard
 
 import jax
@@ -25,14 +25,12 @@ _LONGEST_FORMULA = 90
 """Letters of a formula in a comment."""
 
 
+@dataclass(eq=False)
 class Variable:
     """A number that the code computes or takes as an argument; `name` is "" for a numbered one."""
 
-    def __init__(self, dtype: np.dtype, number: int, name: str = ""):
-        self.dtype, self.number, self.name = dtype, number, name
-
-    def __repr__(self) -> str:
-        return self.name or f"v{self.number}"
+    dtype: np.dtype
+    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,24 +163,39 @@ def drop_unread(routine: Routine) -> tuple[Routine, set[Variable]]:
             needed_statements.append(statement)
         elif isinstance(statement, Repeat):
             carried = statement.carried
-            alive = [variable in needed for variable in carried]
-            while True:
-                body, inside = drop_unread(_select_results(statement.body, alive))
-                before, alive = alive, [is_alive or carry in inside for is_alive, carry in zip(alive, carried, strict=True)]
-                if before == alive:
-                    break
+            body, inside, alive = drop_unread_turns(statement.body, carried, [variable in needed for variable in carried])
             if any(alive):
-                carried, start = _select_marked(carried, alive), _select_marked(statement.start, alive)
+                carried, start = tuple(compress(carried, alive)), tuple(compress(statement.start, alive))
                 needed = (needed | inside) - set(carried) | select_variables(start)
                 needed_statements.append(statement._replace(carried=carried, start=start, body=body))
         else:
             alive = [variable in needed for variable in statement.outs]
             if any(alive):
-                outs = _select_marked(statement.outs, alive)
+                outs = tuple(compress(statement.outs, alive))
                 bodies, inside = zip(*(drop_unread(_select_results(body, alive)) for body in statement.bodies), strict=True)
                 needed = needed.difference(outs).union(*inside, select_variables([statement.condition]))
                 needed_statements.append(statement._replace(outs=outs, bodies=bodies))
     return Routine(tuple(reversed(needed_statements)), routine.results), needed
+
+
+def drop_unread_turns(
+    body: Routine, carried: Sequence[Variable | None], alive: Sequence[bool]
+) -> tuple[Routine, set[Variable], Sequence[bool]]:
+    """Drop what nothing reads in any turn of a routine that is repeated.
+
+    Args:
+        body: the routine.
+        carried: for each of its results, the variable that it becomes in the next turn, or None.
+        alive: for each of them True if it is read after the last turn.
+
+    Returns:
+        The routine, the variables that it reads and does not compute, and which of the results are kept.
+    """
+    while True:
+        needed, inside = drop_unread(_select_results(body, alive))
+        before, alive = alive, [is_alive or carry in inside for is_alive, carry in zip(alive, carried, strict=True)]
+        if before == alive:
+            return needed, inside, alive
 
 
 def are_same(first: Value, second: Value) -> bool:
@@ -193,11 +206,7 @@ def are_same(first: Value, second: Value) -> bool:
 
 
 def _select_results(routine: Routine, marks: Sequence[bool]) -> Routine:
-    return routine._replace(results=_select_marked(routine.results, marks))
-
-
-def _select_marked(candidates: Sequence[Any], marks: Sequence[bool]) -> tuple[Any, ...]:
-    return tuple(candidate for candidate, marked in zip(candidates, marks, strict=True) if marked)
+    return routine._replace(results=tuple(compress(routine.results, marks)))
 
 
 class _Lowering(ScalarWriter):
@@ -211,13 +220,12 @@ class _Lowering(ScalarWriter):
         self._variable_by_operation: dict[Any, Variable] = {}
         """The variable that holds the result of an operation, by the operation's name, type and operands."""
         self._operation_by_variable: dict[Value, Operation] = {}
-        self._numbers = count()
         self._source = ""
         self._is_in_call = False
         """Within a call the source stays that of the call."""
 
     def variable(self, dtype: Any) -> Variable:
-        return Variable(np.dtype(dtype), next(self._numbers))
+        return Variable(np.dtype(dtype))
 
     # jaxprs
 
@@ -261,9 +269,11 @@ class _Lowering(ScalarWriter):
         no, yes = (self.lower_body(branch, operands) for branch in branches)
         # what is the same on both ways is no choice
         differ = [not are_same(a, b) for a, b in zip(yes.results, no.results, strict=True)]
-        merged = [self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)]
+        merged: list[Any] = [
+            self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)
+        ]
         bodies = _select_results(yes, differ), _select_results(no, differ)
-        self.statements.append(Choice(condition, _select_marked(merged, differ), bodies, source))
+        self.statements.append(Choice(condition, tuple(compress(merged, differ)), bodies, source))
         return merged
 
     def lower_body(self, body: ClosedJaxpr, arguments: Sequence[Value]) -> Routine:
@@ -380,10 +390,6 @@ _READABLE_EQUATIONS = {*_INFIX, "neg", "abs", "sqrt", "square", "integer_pow", "
 """Equations with a formula that a reader understands."""
 
 
-def _evaluate_conversion(dtype: np.dtype, a: Any) -> Any:
-    return np.trunc(a) if dtype.kind in "iu" and a.dtype.kind == "f" else a
-
-
 _EVALUATIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(operator, name) for name in ("add", "sub", "mul", "neg", "lt", "le", "gt", "ge", "eq", "ne", "xor")},
     **{name: getattr(np, name) for name in ("abs", "sqrt", "floor", "ceil")},
@@ -402,7 +408,7 @@ _EVALUATIONS: dict[str, Callable[..., Any]] = {
 """How an operation is computed for constants, by the name of the :class:`Operation`."""
 _TYPED_EVALUATIONS: dict[str, Callable[..., Any]] = {
     "shift_right_logical": lambda dtype, a, b: a.view(f"u{dtype.itemsize}") >> b.view(f"u{dtype.itemsize}"),
-    "convert": _evaluate_conversion,
+    "convert": lambda dtype, a: np.trunc(a) if dtype.kind in "iu" and a.dtype.kind == "f" else a,
     "bitcast": lambda dtype, a: np.asarray(a).view(dtype),
     "power_of_two": lambda dtype, n: np.ldexp(dtype.type(1), int(n)),
 }

@@ -18,7 +18,7 @@ from jaxbl.units import on_a_line
 
 from .mujoco_parts import IMPEDANCE, RESOLUTION, Answer, MujocoParts, SideParts, Spring, exactly, unsaid
 from .to_mujoco import to_mujoco
-from .writer import separate
+from .writer import add_element, format_numbers, separate, set_attributes
 
 MUJOCO = "4.0"
 """The version for which models are written."""
@@ -110,7 +110,7 @@ def _describe_numbers(part: Any, slides: bool) -> Iterable[str]:
         value = getattr(part, field.name)
         if value != () and not isinstance(value, bool):
             unit = on_a_line(parameter.unit) if slides else parameter.unit
-            text = _format_numbers(*value) if isinstance(value, tuple) else _format_numbers(value)
+            text = format_numbers(*value) if isinstance(value, tuple) else format_numbers(value)
             yield f"{field.name} = {text} {unit}".rstrip()
 
 
@@ -134,30 +134,28 @@ def _write_model(
         for path, answer in answers.items():
             if answer.fidelity == fidelity:
                 _add_comments(root, f"{heading}: {path}: {answer.text}")
-    ET.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
-    _add_comments(root, f"run.sample_period = {_format_numbers(experiment.run.sample_period)} s: {steps} steps")
-    option = ET.SubElement(root, "option", timestep=_format_numbers(step), integrator="RK4", gravity=f"0 0 {-_GRAVITY}")
-    ET.SubElement(option, "flag", contact="disable")
-    world = ET.SubElement(root, "worldbody")
-    ET.SubElement(world, "light", pos="0 -1 2", dir="0 0.5 -1")
+    add_element(root, "compiler", angle="radian", inertiafromgeom="false")
+    _add_comments(root, f"run.sample_period = {format_numbers(experiment.run.sample_period)} s: {steps} steps")
+    option = add_element(root, "option", timestep=step, integrator="RK4", gravity=f"0 0 {-_GRAVITY}")
+    add_element(option, "flag", contact="disable")
+    world = add_element(root, "worldbody")
+    add_element(world, "light", pos="0 -1 2", dir="0 0.5 -1")
     for i, (side, side_parts) in enumerate(parts.sides.items()):
         numbers = _describe_numbers(experiment.drive, side_parts.slides)
         _add_comments(world, *(f"drive.{number}" for number in numbers if number.startswith(side)))
         _add_comments(world, *notes.get(side, ()))
         _add_side(world, side, side_parts, 0.25 * i, step)
-    root.append(_make_tendons(parts, notes.get("transmission", [])))
-    root.append(_make_actuators(parts, notes.get("actuator", []), step))
-    root.append(_make_sensors(parts))
-    root.append(_make_keyframe(experiment, parts))
-    for empty_element in [element for element in root if element.tag == "tendon" and not len(element)]:
-        root.remove(empty_element)
+    _add_tendons(root, parts, notes.get("transmission", []))
+    _add_actuators(root, parts, notes.get("actuator", []), step)
+    _add_sensors(root, parts)
+    _add_keyframe(root, experiment, parts)
     ET.indent(root, "  ")
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
 def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, step: float) -> None:
     """Add the body of a side, with its joint."""
-    body = ET.SubElement(world, "body", name=side, pos=f"{_format_numbers(offset)} 0 0")
+    body = add_element(world, "body", name=side, pos=(offset, 0, 0))
     # the inertia of eccentric masses is part of the side's: half of it at most
     arms = [min(_ARM, 0.5 * parts.inertia / len(parts.pendulums) * _GRAVITY / mass.torque) for mass in parts.pendulums]
     round_off = 1e-6 * parts.inertia
@@ -165,143 +163,120 @@ def _add_side(world: ET.Element, side: str, parts: SideParts, offset: float, ste
         mass.torque / _GRAVITY * arm + round_off for mass, arm in zip(parts.pendulums, arms, strict=True)
     )
     _add_inertia(body, parts.inertia - inertia_of_masses, parts.slides)
-    joint = {"name": side, "type": "slide" if parts.slides else "hinge", "axis": "1 0 0" if parts.slides else "0 1 0"}
-    joint["damping"] = _format_numbers(parts.viscous, *([parts.drag] if parts.drag else []))
+    moves = {"type": "slide", "axis": "1 0 0"} if parts.slides else {"type": "hinge", "axis": "0 1 0"}
+    joint = add_element(
+        body, "joint", name=side, **moves, damping=(parts.viscous, parts.drag) if parts.drag else parts.viscous
+    )
     if parts.dry:
         # as hard as the steps allow: MuJoCo's defaults are softer
-        joint |= {"frictionloss": _format_numbers(parts.dry), "solreffriction": f"{_format_numbers(2.0 * step)} 1"}
-        joint |= {"solimpfriction": f"{IMPEDANCE} {IMPEDANCE} 0.001"}
-    ET.SubElement(body, "joint", joint)
+        set_attributes(
+            joint, frictionloss=parts.dry, solreffriction=(2.0 * step, 1), solimpfriction=f"{IMPEDANCE} {IMPEDANCE} 0.001"
+        )
     appearance = {"contype": "0", "conaffinity": "0", "rgba": _COLOURS[side]}
     if parts.slides:
-        ET.SubElement(body, "geom", appearance | {"type": "box", "size": "0.06 0.04 0.04"})
+        add_element(body, "geom", **appearance, type="box", size="0.06 0.04 0.04")
     else:
-        ET.SubElement(
-            body,
-            "geom",
-            appearance | {"type": "cylinder", "size": "0.08 0.02", "euler": f"{_format_numbers(math.pi / 2)} 0 0"},
-        )
-        ET.SubElement(
-            body, "geom", appearance | {"type": "box", "size": "0.01 0.022 0.03", "pos": "0 0 -0.05", "rgba": "1 1 1 1"}
-        )
+        add_element(body, "geom", **appearance, type="cylinder", size="0.08 0.02", euler=(math.pi / 2, 0, 0))
+        pointer = appearance | {"rgba": "1 1 1 1"}
+        add_element(body, "geom", **pointer, type="box", size="0.01 0.022 0.03", pos="0 0 -0.05")
     for i, (mass, arm) in enumerate(zip(parts.pendulums, arms, strict=True)):
-        mass_position = f"{_format_numbers(arm * math.sin(mass.phase))} 0 {_format_numbers(-arm * math.cos(mass.phase))}"
-        eccentric = ET.SubElement(body, "body", name=f"{side}_mass{i}", pos=mass_position)
+        place = arm * math.sin(mass.phase), 0, -arm * math.cos(mass.phase)
+        eccentric = add_element(body, "body", name=f"{side}_mass{i}", pos=place)
         _add_inertia(eccentric, round_off, mass=mass.torque / _GRAVITY / arm)
-        ET.SubElement(eccentric, "geom", appearance | {"type": "sphere", "size": "0.02"})
+        add_element(eccentric, "geom", **appearance, type="sphere", size=0.02)
     for i, flexible in enumerate(parts.flexible_inertias):
-        flexible_body = ET.SubElement(body, "body", name=_name_behind_spring(side, i))
+        name = f"{side}_behind_spring{i}"
+        flexible_body = add_element(body, "body", name=name)
         _add_inertia(flexible_body, flexible.inertia, parts.slides)
-        joint_attributes = {"name": _name_behind_spring(side, i), "type": joint["type"], "axis": joint["axis"]}
-        ET.SubElement(
-            flexible_body,
-            "joint",
-            joint_attributes
-            | {"stiffness": _format_numbers(flexible.stiffness), "damping": _format_numbers(flexible.damping)},
-        )
+        add_element(flexible_body, "joint", name=name, **moves, stiffness=flexible.stiffness, damping=flexible.damping)
 
 
 def _add_inertia(body: ET.Element, inertia: float, slides: bool = False, mass: float = 1.0) -> None:
     """Add an inertia to a body: a mass along a line, a moment about the axis."""
-    diagonal = _format_numbers(inertia, inertia, inertia)
-    ET.SubElement(body, "inertial", pos="0 0 0", mass=_format_numbers(inertia if slides else mass), diaginertia=diagonal)
+    add_element(body, "inertial", pos="0 0 0", mass=inertia if slides else mass, diaginertia=[inertia] * 3)
 
 
-def _name_behind_spring(side: str, i: int) -> str:
-    return f"{side}_behind_spring{i}"
-
-
-def _make_tendons(parts: MujocoParts, notes: list[str]) -> ET.Element:
-    """Make the gear, and springs on one joint."""
-    tendons, gap, limits = ET.Element("tendon"), parts.half_gap, {}
+def _add_tendons(root: ET.Element, parts: MujocoParts, notes: list[str]) -> None:
+    """Add the gear, and springs on one joint."""
+    tendons, gap, limits = ET.Element("tendon"), parts.half_gap, dict[str, Any]()
     springs = [spring._replace(low=spring.low - gap, high=spring.high + gap) for spring in parts.springs]
     if springs:
         _add_comments(
-            tendons, f"The twist z = theta_e - N_0 theta_s, drive.gear_ratio N_0 = {_format_numbers(parts.ratio)}", *notes
+            tendons, f"The twist z = theta_e - N_0 theta_s, drive.gear_ratio N_0 = {format_numbers(parts.ratio)}", *notes
         )
     if parts.damping and gap:
         # the limits are springs with dampers as well, being weak constraints: they act from the gap on, and do not pull
         stiffness = sum(spring.linear for spring in springs)
         springs[0] = springs[0]._replace(linear=springs[0].linear - stiffness)
         limits = {
-            "range": f"{_format_numbers(-gap)} {_format_numbers(gap)}",
+            "range": (-gap, gap),
             "limited": "true",
-            "solreflimit": _format_numbers(-stiffness * parts.mobility, -parts.damping * parts.mobility),
+            "solreflimit": (-stiffness * parts.mobility, -parts.damping * parts.mobility),
             "solimplimit": "0.0001 0.0001 0.001",
         }
     elif parts.damping:
-        limits = {"damping": _format_numbers(parts.damping)}
+        limits = {"damping": parts.damping}
     for i, spring in enumerate(springs):
-        tendon = ET.SubElement(tendons, "fixed", {"name": f"gear{i}"} | _spring_attributes(spring) | ({} if i else limits))
-        ET.SubElement(tendon, "joint", joint="motor", coef="1")
-        ET.SubElement(tendon, "joint", joint="load", coef=_format_numbers(-float(parts.ratio or 0.0)))
+        tendon = _add_spring(tendons, f"gear{i}", spring, "motor", **({} if i else limits))
+        add_element(tendon, "joint", joint="load", coef=-float(parts.ratio or 0.0))
     for side, side_parts in parts.sides.items():
         for i, spring in enumerate(side_parts.springs):
-            tendon = ET.SubElement(tendons, "fixed", {"name": f"{side}_spring{i}"} | _spring_attributes(spring))
-            ET.SubElement(tendon, "joint", joint=side, coef="1")
-    return tendons
+            _add_spring(tendons, f"{side}_spring{i}", spring, side)
+    if len(tendons):
+        root.append(tendons)
 
 
-def _spring_attributes(spring: Spring) -> dict[str, str]:
-    stiffness = _format_numbers(spring.linear, *([0, spring.cubic] if spring.cubic else []))
-    return {"stiffness": stiffness, "springlength": _format_numbers(spring.low, spring.high)}
+def _add_spring(tendons: ET.Element, name: str, spring: Spring, joint: str, **more: Any) -> ET.Element:
+    stiffness = (spring.linear, 0, spring.cubic) if spring.cubic else spring.linear
+    tendon = add_element(tendons, "fixed", name=name, stiffness=stiffness, springlength=(spring.low, spring.high), **more)
+    add_element(tendon, "joint", joint=joint, coef=1)
+    return tendon
 
 
-def _make_actuators(parts: MujocoParts, notes: list[str], step: float) -> ET.Element:
-    """Make the input, and passive motors for friction and torques over the position."""
-    actuators, chain = ET.Element("actuator"), parts.actuator
-    attributes = {"name": "input", "joint": "motor", "gainprm": _format_numbers(chain.gain)}
+def _add_actuators(root: ET.Element, parts: MujocoParts, notes: list[str], step: float) -> None:
+    """Add the input, and passive motors for friction and torques over the position."""
+    actuators, chain = add_element(root, "actuator"), parts.actuator
+    _add_comments(actuators, "The input u, held from sample to sample", *notes)
+    driven = add_element(actuators, "general", name="input", joint="motor", gainprm=chain.gain)
     if chain.lag is not None:
-        attributes |= {"dyntype": "filterexact", "dynprm": _format_numbers(chain.lag)}
+        set_attributes(driven, dyntype="filterexact", dynprm=chain.lag)
     for name, limit in (("ctrl", chain.limit), ("force", chain.torque_limit)):
         if math.isfinite(limit):
-            attributes |= {f"{name}range": f"{_format_numbers(-limit)} {_format_numbers(limit)}", f"{name}limited": "true"}
-    _add_comments(actuators, "The input u, held from sample to sample", *notes)
-    driven = ET.SubElement(actuators, "general", attributes)
+            set_attributes(driven, **{f"{name}range": (-limit, limit), f"{name}limited": "true"})
     if chain.delay:
-        driven.attrib.update(delay=_format_numbers(chain.delay), nsample=str(math.ceil(chain.delay / step) + 2))
+        set_attributes(driven, delay=chain.delay, nsample=math.ceil(chain.delay / step) + 2)
     for side, side_parts in parts.sides.items():
         passive = {"joint": side, "input": "none", "motorconst": "0", "resistance": "1"}
         for i, wave in enumerate(side_parts.waves):
-            ET.SubElement(actuators, "dcmotor", passive, name=f"{side}_wave{i}", cogging=_format_numbers(*wave))
+            add_element(actuators, "dcmotor", **passive, name=f"{side}_wave{i}", cogging=wave)
         for i, bristles in enumerate(side_parts.bristles):
-            ET.SubElement(actuators, "dcmotor", passive, name=f"{side}_friction{i}", lugre=_format_numbers(*bristles))
-    return actuators
+            add_element(actuators, "dcmotor", **passive, name=f"{side}_friction{i}", lugre=bristles)
 
 
-def _make_sensors(parts: MujocoParts) -> ET.Element:
-    sensors = ET.Element("sensor")
+def _add_sensors(root: ET.Element, parts: MujocoParts) -> None:
+    sensors = add_element(root, "sensor")
     for side in parts.sides:
-        ET.SubElement(sensors, "jointpos", name=f"{side}_position", joint=side)
-        ET.SubElement(sensors, "jointvel", name=f"{side}_velocity", joint=side)
+        add_element(sensors, "jointpos", name=f"{side}_position", joint=side)
+        add_element(sensors, "jointvel", name=f"{side}_velocity", joint=side)
     if parts.ratio is not None:
-        ET.SubElement(sensors, "tendonpos", name="twist", tendon="gear0")
-    ET.SubElement(sensors, "actuatorfrc", name="motor_torque", actuator="input")
-    return sensors
+        add_element(sensors, "tendonpos", name="twist", tendon="gear0")
+    add_element(sensors, "actuatorfrc", name="motor_torque", actuator="input")
 
 
-def _make_keyframe(experiment: Experiment, parts: MujocoParts) -> ET.Element:
-    """The state at t = 0."""
-    keyframe = ET.Element("keyframe")
-    positions, velocities = [], []
+def _add_keyframe(root: ET.Element, experiment: Experiment, parts: MujocoParts) -> None:
+    """Add the state at t = 0."""
+    keyframe, positions, velocities = add_element(root, "keyframe"), [], []
     for side, side_parts in parts.sides.items():
-        start = (getattr(experiment.initial, f"{side}_{name}") for name in ("position", "velocity"))
-        for numbers, value in zip((positions, velocities), start, strict=True):
-            numbers.append(_format_numbers(value))
+        position, velocity = (getattr(experiment.initial, f"{side}_{name}") for name in ("position", "velocity"))
         # what is behind a spring stands still: its joint's velocity is that against the side
-        positions += ["0"] * len(side_parts.flexible_inertias)
-        velocities += [_format_numbers(-getattr(experiment.initial, f"{side}_velocity"))] * len(side_parts.flexible_inertias)
+        count = len(side_parts.flexible_inertias)
+        positions += [position, *[0] * count]
+        velocities += [velocity, *[-velocity] * count]
     _add_comments(keyframe, "initial.*: the state at t = 0")
-    ET.SubElement(keyframe, "key", name="initial", qpos=" ".join(positions), qvel=" ".join(velocities))
-    return keyframe
+    add_element(keyframe, "key", name="initial", qpos=positions, qvel=velocities)
 
 
 def _add_comments(parent: ET.Element, *texts: str) -> None:
     for text in texts:
         # two dashes end a comment
         parent.append(ET.Comment(f" {separate(text, '--')} "))
-
-
-def _format_numbers(*values: Any) -> str:
-    """Write numbers with all their digits, with spaces between them."""
-    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)

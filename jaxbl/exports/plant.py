@@ -118,13 +118,10 @@ def _trace_plant(
             experiment, study_values | {path: arguments[name] for path, name in numbers.items() if name in arguments}
         )
 
-    def start(study_values: Values, arguments: Values) -> MovingDrive:
-        experiment = place_numbers(study_values, arguments)
-        return MovingDrive(experiment.plant.init(experiment.initial), jnp.zeros((), jnp.int32))
-
-    def first_outputs(study_values: Values, state: MovingDrive, arguments: Values) -> Values:
-        outputs = _read_outputs(place_numbers(study_values, arguments), None, state.plant, jnp.zeros((), dtype))
-        return {key: value for key, (value, _, _) in outputs.items()}
+    def start(study_values: Values, arguments: Values) -> tuple[MovingDrive, Outputs]:
+        placed = place_numbers(study_values, arguments)
+        state = MovingDrive(placed.plant.init(placed.initial), jnp.zeros((), jnp.int32))
+        return state, _read_outputs(placed, None, state.plant, jnp.zeros((), dtype))
 
     def step(study_values: Values, state: MovingDrive, arguments: Values) -> tuple[MovingDrive, Outputs]:
         placed = place_numbers(study_values, arguments)
@@ -134,7 +131,7 @@ def _trace_plant(
         return MovingDrive(moved, samples), _read_outputs(placed, state.plant, moved, arguments[_INPUT])
 
     study_numbers = {PERIOD: read_study_numbers(experiment)[PERIOD]}
-    return trace_block(name, dtype, study_numbers, start_inputs, [torque, *step_inputs], start, step, first_outputs)
+    return trace_block(name, dtype, study_numbers, start_inputs, [torque, *step_inputs], start, step)
 
 
 def _read_outputs(experiment: Experiment, before: PlantState | None, state: PlantState, torque: Any) -> Outputs:

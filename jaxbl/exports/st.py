@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbl.fused import Unsupported
 
-from .block import Program, describe_number
+from .block import Port, Program, describe_number
 from .c import C_INFIX, describe_constant
 from .lowering import Constant, Operation, Value
 from .writer import Writer, write_comment, write_shortest
@@ -35,11 +35,14 @@ def st_type(dtype: np.dtype) -> str:
 
 
 class _St(Writer):
-    marks = "(*", "*)"
+    marks, assignment = ("(*", "*)"), ":="
+    choice, otherwise, end_choice = "IF %s THEN", "ELSE", "END_IF;"
+    end_repeat = "END_FOR;"
 
     def __init__(self, program: Program):
         super().__init__(program)
-        self._temporary: list[tuple[str, np.dtype]] = []
+        self._temporary: list[str] = []
+        """Declarations of variables that keep nothing from sample to sample."""
         self._operation_by_variable: dict[Value, Operation] = {}
         """Operations by the variable that holds their result."""
         for name in ("restart", "started"):
@@ -72,31 +75,27 @@ class _St(Writer):
         inputs = {quantity.name: quantity for quantity in (*block.start_inputs, *block.inputs)}.values()
         self.lines, self._depth = [write_comment(self.marks, *head_lines)], 0
         self.add_lines(f"FUNCTION_BLOCK {block.name}")
-        self._declare_variables(
-            "VAR_INPUT",
-            [(quantity.name, quantity.dtype, quantity) for quantity in inputs],
-            "restart: BOOL := FALSE; (* begin anew *)",
-        )
-        self._declare_variables("VAR_OUTPUT", [(quantity.name, quantity.dtype, quantity) for quantity in block.outputs])
-        constants = [
-            f"{name}: {st_type(constant.dtype)} := {self.literal(constant)}; "
-            + write_comment(self.marks, describe_constant(program, constant))
-            for constant, name in self.constants.items()
-        ]
-        self._declare_variables("VAR CONSTANT", [], *constants)
-        states = [(self.name(variable), variable.dtype, None) for variable in program.state_variables]
-        self._declare_variables("VAR", states, "started: BOOL := FALSE;")
-        self._declare_variables("VAR_TEMP", [(name, dtype, None) for name, dtype in self._temporary])
+        declarations = {
+            "VAR_INPUT": [*map(self._declare_port, inputs), "restart: BOOL := FALSE; (* begin anew *)"],
+            "VAR_OUTPUT": [*map(self._declare_port, block.outputs)],
+            "VAR CONSTANT": [
+                f"{name}: {st_type(constant.dtype)} := {self.literal(constant)}; "
+                + write_comment(self.marks, describe_constant(program, constant))
+                for constant, name in self.constants.items()
+            ],
+            "VAR": [
+                *(f"{self.name(variable)}: {st_type(variable.dtype)};" for variable in program.state_variables),
+                "started: BOOL := FALSE;",
+            ],
+            "VAR_TEMP": self._temporary,
+        }
+        for kind, lines in declarations.items():
+            if lines:
+                self.add_lines(kind, *(f"    {line}" for line in lines), "END_VAR")
         return "\n".join([*self.lines, *body, "END_FUNCTION_BLOCK", ""])
 
-    def _declare_variables(self, kind: str, variables: Sequence[tuple], *more_lines: str) -> None:
-        if not variables and not more_lines:
-            return
-        self.add_lines(kind)
-        for name, dtype, quantity in variables:
-            remark = f" {write_comment(self.marks, describe_number(quantity))}" if quantity else ""
-            self.add_lines(f"    {name}: {st_type(dtype)};{remark}")
-        self.add_lines(*(f"    {line}" for line in more_lines), "END_VAR")
+    def _declare_port(self, port: Port) -> str:
+        return f"{port.name}: {st_type(port.dtype)}; {write_comment(self.marks, describe_number(port))}"
 
     def literal(self, constant):
         kind, value = st_type(constant.dtype), constant.value.item()
@@ -111,34 +110,19 @@ class _St(Writer):
         # the standard wants a point in each real number
         return f"{kind}#{mantissa if '.' in mantissa else f'{mantissa}.0'}{mark}{exponent}"
 
-    def define(self, out, text):
-        self.declare(out, text)
-
     def declare(self, out, text):
-        self._temporary.append((self.name(out), out.dtype))
+        self._temporary.append(f"{self.name(out)}: {st_type(out.dtype)};")
         if text is not None:
             self.assign(self.name(out), text)
 
-    def assign(self, name, text):
-        self.add_lines(f"{name} := {text};")
-
     def begin_repeat(self, times):
-        index = self._add_temporary(np.dtype(np.int32), "turn")
+        index = self._add_temporary("DINT", "turn")
         self.add_lines(f"FOR {index} := 1 TO {times} DO")
 
-    def begin_if(self, condition):
-        self.add_lines(f"IF {condition} THEN")
-
-    def begin_else(self):
-        self.add_lines("ELSE")
-
-    def end(self, statement):
-        self.add_lines("END_FOR;" if statement == "repeat" else "END_IF;")
-
-    def _add_temporary(self, dtype: np.dtype, name: str) -> str:
+    def _add_temporary(self, dtype: str, name: str) -> str:
         """A variable more."""
         unused = self.make_unique(name)
-        self._temporary.append((unused, dtype))
+        self._temporary.append(f"{unused}: {dtype};")
         return unused
 
     def write_operation(self, operation: Operation):
@@ -148,14 +132,11 @@ class _St(Writer):
         if name == "div" and out.dtype.kind == "f" and not isinstance(operands[1], Constant):
             # controllers stop at a division by zero
             self.declare(out, None)
-            zero = f"{kind}#0.0"
-            self.add_lines(
-                f"IF {texts[1]} <> {zero} THEN",
-                f"    {self.name(out)} := {texts[0]} / {texts[1]};",
-                "ELSE",
-                f"    {self.name(out)} := {zero};",
-                "END_IF;",
-            )
+            self.add_lines(f"""IF {texts[1]} <> {kind}#0.0 THEN
+    {self.name(out)} := {texts[0]} / {texts[1]};
+ELSE
+    {self.name(out)} := {kind}#0.0;
+END_IF;""")
         elif name in _INFIX and (name not in ("and", "or", "xor") or logical):
             self.define(out, f"{texts[0]} {_INFIX[name]} {texts[1]}")
         elif name == "not" and logical:
@@ -188,52 +169,44 @@ class _St(Writer):
         """Write a rounding by a conversion, whichever neighbour it takes. Numbers beyond 2^30 stay as they are."""
         kind, out = st_type(operation.out.dtype), self.name(operation.out)
         self.declare(operation.out, None)
-        n, remainder = self._add_temporary(np.dtype(np.int32), "near"), self._add_temporary(operation.out.dtype, "rest")
-        up, down = f"{out} := {out} + {kind}#1.0;", f"{out} := {out} - {kind}#1.0;"
+        n, remainder = self._add_temporary("DINT", "near"), self._add_temporary(kind, "rest")
         odd = f"{n} MOD DINT#2 <> DINT#0"
-        fits = {
-            "floor": [f"IF {remainder} < {kind}#0.0 THEN", f"    {down}", "END_IF;"],
-            "ceil": [f"IF {remainder} > {kind}#0.0 THEN", f"    {up}", "END_IF;"],
-            "round_even": [
-                f"IF ({remainder} > {kind}#0.5) OR (({remainder} = {kind}#0.5) AND ({odd})) THEN",
-                f"    {up}",
-                f"ELSIF ({remainder} < {kind}#-0.5) OR (({remainder} = {kind}#-0.5) AND ({odd})) THEN",
-                f"    {down}",
-                "END_IF;",
-            ],
+        fit = {
+            "floor": f"""    IF {remainder} < {kind}#0.0 THEN
+        {out} := {out} - {kind}#1.0;""",
+            "ceil": f"""    IF {remainder} > {kind}#0.0 THEN
+        {out} := {out} + {kind}#1.0;""",
+            "round_even": f"""    IF ({remainder} > {kind}#0.5) OR (({remainder} = {kind}#0.5) AND ({odd})) THEN
+        {out} := {out} + {kind}#1.0;
+    ELSIF ({remainder} < {kind}#-0.5) OR (({remainder} = {kind}#-0.5) AND ({odd})) THEN
+        {out} := {out} - {kind}#1.0;""",
         }[operation.name]
-        self.add_lines(
-            f"{out} := {x};",
-            f"IF ABS({x}) < {kind}#1073741824.0 THEN",
-            f"    {n} := {kind}_TO_DINT({x});",
-            f"    {out} := DINT_TO_{kind}({n});",
-            f"    {remainder} := {x} - {out};",
-            *(f"    {line}" for line in fits),
-            "END_IF;",
-        )
+        self.add_lines(f"""{out} := {x};
+IF ABS({x}) < {kind}#1073741824.0 THEN
+    {n} := {kind}_TO_DINT({x});
+    {out} := DINT_TO_{kind}({n});
+    {remainder} := {x} - {out};
+{fit}
+    END_IF;
+END_IF;""")
 
     def _write_power_of_two(self, operation: Operation, n: str) -> None:
         """Write a power of two by squares of 2 or 1 / 2, which are exact."""
         kind, out = st_type(operation.out.dtype), self.name(operation.out)
         self.declare(operation.out, None)
-        left, factor = (
-            self._add_temporary(np.dtype(np.int32), "remaining"),
-            self._add_temporary(operation.out.dtype, "factor"),
-        )
-        self.add_lines(
-            f"{out} := {kind}#1.0;",
-            f"{factor} := SEL({n} < DINT#0, {kind}#2.0, {kind}#0.5);",
-            f"{left} := ABS({n});",
-            f"WHILE {left} > DINT#0 DO",
-            f"    IF {left} MOD DINT#2 <> DINT#0 THEN",
-            f"        {out} := {out} * {factor};",
-            "    END_IF;",
-            f"    {left} := {left} / DINT#2;",
-            f"    IF {left} > DINT#0 THEN",
-            f"        {factor} := {factor} * {factor};",
-            "    END_IF;",
-            "END_WHILE;",
-        )
+        left, factor = self._add_temporary("DINT", "remaining"), self._add_temporary(kind, "factor")
+        self.add_lines(f"""{out} := {kind}#1.0;
+{factor} := SEL({n} < DINT#0, {kind}#2.0, {kind}#0.5);
+{left} := ABS({n});
+WHILE {left} > DINT#0 DO
+    IF {left} MOD DINT#2 <> DINT#0 THEN
+        {out} := {out} * {factor};
+    END_IF;
+    {left} := {left} / DINT#2;
+    IF {left} > DINT#0 THEN
+        {factor} := {factor} * {factor};
+    END_IF;
+END_WHILE;""")
 
 
 _INFIX = C_INFIX | {"rem": "MOD", "eq": "=", "ne": "<>", "and": "AND", "or": "OR", "xor": "XOR"}

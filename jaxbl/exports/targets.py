@@ -96,7 +96,9 @@ def _export_c(request: Request) -> Files:
     program, name = _lower_observers(request), request.name
     code = write_c_code(program, _write_head_of_code(request, program, _write_c_call(program)))
     texts = {f"{name}.c": code.source, f"{name}.h": code.header, f"{name}_filter.c": write_filter_code(program)}
-    summary = _summarise(request, program) | {"state_bytes": count_state_bytes(program)}
+    # of a struct, where numbers are aligned to their own size
+    state = np.dtype([(quantity.name, quantity.dtype) for quantity in program.state], align=True)
+    summary = _summarise(request, program) | {"state_bytes": state.itemsize}
     lines = [
         f"{name}.c, {name}.h: {_describe_cost(request, program)}, and a state of {summary['state_bytes']} bytes.",
         f"{name}_filter.c: an example that reads {','.join(input_columns(program))} as CSV:",
@@ -329,12 +331,3 @@ def _summarise(request: Request, program: Program) -> JsonObject:
 
 def _describe_port(port: Port) -> dict[str, str]:
     return {"name": port.name, "unit": port.unit, "about": port.description, "type": str(port.dtype)}
-
-
-def count_state_bytes(program: Program) -> int:
-    """Return the size of the state's struct in bytes where numbers are aligned to their own size."""
-    sizes = [quantity.dtype.itemsize for quantity in program.state]
-    end = 0
-    for size in sizes:
-        end = -(-end // size) * size + size
-    return -(-end // max(sizes)) * max(sizes)

@@ -2,6 +2,8 @@
 
 import abc
 import re
+import textwrap
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from itertools import chain, count
 from typing import Any
@@ -30,9 +32,16 @@ class Writer(abc.ABC):
     """Writes the routines of a program as lines. A statement does one operation, so that compilers that contract only within
     statements contract nothing."""
 
-    indent = "    "
     marks: tuple[str, str]
     """Those between which a comment stands."""
+    assignment: str
+    """The sign between a variable and its new value."""
+    choice: str
+    """Lines that begin a choice, with a place for its condition."""
+    otherwise: str
+    """Lines that begin the other branch of a choice."""
+    end_choice: str
+    end_repeat: str
 
     def __init__(self, program: Program):
         self.program = program
@@ -43,8 +52,8 @@ class Writer(abc.ABC):
         block = program.block
         self._used = {quantity.name.lower() for quantity in (*block.start_inputs, *block.inputs, *block.outputs)}
         self._numbers = count(1)
-        constants = [quantity for routine in (program.start, program.step) for quantity in find_constants(routine)]
-        self.constants = name_constants(dict.fromkeys(constants), program.block.study_numbers)
+        constants = [*find_constants(program.start), *find_constants(program.step)]
+        self.constants = name_constants(dict.fromkeys(constants), block.study_numbers)
 
     # what a language says
 
@@ -53,16 +62,8 @@ class Writer(abc.ABC):
         """Write a number."""
 
     @abc.abstractmethod
-    def define(self, out: Variable, text: str) -> None:
-        """Define a variable that does not change."""
-
-    @abc.abstractmethod
     def declare(self, out: Variable, text: str | None) -> None:
         """Declare a variable that changes later, with its first value if there is one."""
-
-    @abc.abstractmethod
-    def assign(self, name: str, text: str) -> None:
-        """Change a variable."""
 
     @abc.abstractmethod
     def write_operation(self, operation: Operation) -> None:
@@ -72,23 +73,20 @@ class Writer(abc.ABC):
     def begin_repeat(self, times: int) -> None:
         """Begin a loop."""
 
-    @abc.abstractmethod
-    def begin_if(self, condition: str) -> None:
-        """Begin a choice."""
-
-    @abc.abstractmethod
-    def begin_else(self) -> None:
-        """Begin the other branch of a choice."""
-
-    @abc.abstractmethod
-    def end(self, statement: str) -> None:
-        """End a "repeat" or an "if"."""
-
     # what they have in common
 
-    def add_lines(self, *lines: str) -> None:
-        """Add lines at the present depth."""
-        self.lines += [f"{self.indent * self._depth}{line}" if line else "" for line in lines]
+    def add_lines(self, *texts: str) -> None:
+        """Add texts of one or more lines at the present depth."""
+        for text in texts:
+            self.lines += textwrap.indent(text, "    " * self._depth).split("\n")
+
+    def define(self, out: Variable, text: str) -> None:
+        """Define a variable that does not change."""
+        self.declare(out, text)
+
+    def assign(self, name: str, text: str) -> None:
+        """Change a variable."""
+        self.add_lines(f"{name} {self.assignment} {text};")
 
     def text(self, value: Value) -> str:
         """Write a value in an expression."""
@@ -136,14 +134,14 @@ class Writer(abc.ABC):
         self.write_statements(loop.body.statements)
         self._assign_together(loop.carried, loop.body.results)
         self._depth -= 1
-        self.end("repeat")
+        self.add_lines(self.end_repeat)
 
     def _assign_together(self, variables: Sequence[Variable], results: Sequence[Value]) -> None:
         """Assign results to variables, all at once: a variable that is read after its assignment is copied first."""
         texts, assigned = [], set()
         for variable, value in zip(variables, results, strict=True):
             if value in assigned and isinstance(value, Variable):
-                old_value = Variable(value.dtype, -1)
+                old_value = Variable(value.dtype)
                 self.define(old_value, self.text(value))
                 value = old_value
             texts.append(self.text(value))
@@ -157,7 +155,7 @@ class Writer(abc.ABC):
         short = not no.statements
         for variable, value in zip(choice.outs, no.results, strict=True):
             self.declare(variable, self.text(value) if short else None)
-        self.begin_if(self.text(choice.condition))
+        self.add_lines(self.choice % self.text(choice.condition))
         for body in choice.bodies:
             self._depth += 1
             self.write_statements(body.statements)
@@ -167,13 +165,13 @@ class Writer(abc.ABC):
             if short:
                 break
             if body is yes:
-                self.begin_else()
-        self.end("if")
+                self.add_lines(self.otherwise)
+        self.add_lines(self.end_choice)
 
 
 def _shorten_source(source: str) -> str:
     """Shorten the name of a source function by what Python adds to it."""
-    return source.replace("<locals>.", "").replace(".<dictcomp>", "").replace(".<genexpr>", "").replace(".<lambda>", "")
+    return re.sub(r"\.<(locals|dictcomp|genexpr|lambda)>", "", source)
 
 
 def find_unread_names(routine: Routine, quantities: Sequence[Port]) -> list[str]:
@@ -188,9 +186,10 @@ def write_shortest(value: Any) -> str:
     return text if any(mark in text for mark in ".en") else f"{text}.0"
 
 
-_LETTERS = {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho", "\\": "/"}
-
-
+_LETTERS = str.maketrans(
+    {"²": "^2", "³": "^3", "√": "sqrt ", "·": " ", "°": "deg", "–": "-", "—": "-", "±": "+-", "ρ": "rho", "\\": "/"}
+)
+"""What stands for letters that not every compiler reads, and for the one that joins lines."""
 _COMMENT_MARKS = "*/", "/*", "(*", "*)", "??"
 """Pairs of letters that begin or end a comment; two question marks begin a trigraph of C."""
 
@@ -204,12 +203,25 @@ def separate(text: str, *pairs: str) -> str:
 def write_comment(marks: tuple[str, str], *lines: str) -> str:
     """Write a comment between its marks. No line of it ends the comment, or is joined with the next one."""
     begin, end = marks
-    texts = (f"   {separate(to_ascii(line), *_COMMENT_MARKS)}".rstrip() for line in lines)
+    plain_lines = (line.translate(_LETTERS).encode("ascii", "replace").decode() for line in lines)
+    texts = (f"   {separate(line, *_COMMENT_MARKS)}".rstrip() for line in plain_lines)
     return f"{begin}{chr(10).join(texts)[2:]} {end}"
 
 
-def to_ascii(text: str) -> str:
-    """Replace the letters that not every compiler reads, and the one that joins lines."""
-    for letter, other in _LETTERS.items():
-        text = text.replace(letter, other)
-    return text.encode("ascii", "replace").decode()
+def add_element(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
+    """Add an XML element with attributes: texts, a number, or several numbers."""
+    element = ET.SubElement(parent, tag)
+    set_attributes(element, **attributes)
+    return element
+
+
+def set_attributes(element: ET.Element, **attributes: Any) -> None:
+    """Set attributes of an XML element: texts, a number, or several numbers."""
+    for name, value in attributes.items():
+        numbers = value if isinstance(value, Sequence) else [value]
+        element.set(name, value if isinstance(value, str) else format_numbers(*numbers))
+
+
+def format_numbers(*values: Any) -> str:
+    """Write numbers with all their digits, with spaces between them."""
+    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)

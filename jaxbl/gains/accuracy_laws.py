@@ -182,31 +182,26 @@ def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None
 def _fit_line(log_x: np.ndarray, log_y: np.ndarray, first: int, last: int) -> PowerLawFit | None:
     """Fit a line to the points first ... last by least squares; None if a point is too far from it, or it bends."""
     run_x, run_y = log_x[first : last + 1], log_y[first : last + 1]
-    centred_x, slope = run_x - run_x.mean(), _least_squares_slope(run_x, run_y)
-    intercept = float(run_y.mean() - slope * run_x.mean())
+    slope, intercept = map(float, np.polyfit(run_x, run_y, 1))
     residual = run_y - intercept - slope * run_x
-    standard_error = math.sqrt(float(residual @ residual) / (len(run_x) - 2) / float(centred_x @ centred_x))
+    standard_error = math.sqrt(float(residual @ residual) / (len(run_x) - 2) / _squared_deviations(run_x))
     middle = (len(run_x) + 1) // 2
-    half_slopes = (
-        _least_squares_slope(run_x[:middle], run_y[:middle]),
-        _least_squares_slope(run_x[-middle:], run_y[-middle:]),
-    )
+    halves = slice(middle), slice(-middle, None)
+    lower, upper = (float(np.polyfit(run_x[half], run_y[half], 1)[0]) for half in halves)
     # the scatter is taken from each point's distance to the line through its neighbours; a bend moves all of them alike, and
     # is left out of the variance
     weights = (run_x[1:-1] - run_x[:-2]) / (run_x[2:] - run_x[:-2])
     misses = run_y[1:-1] - (1.0 - weights) * run_y[:-2] - weights * run_y[2:]
     variance = float(np.var(misses / np.sqrt(1.0 + weights**2 + (1.0 - weights) ** 2), ddof=1))
-    inverse_squares = sum(1.0 / float(((half - half.mean()) ** 2).sum()) for half in (run_x[:middle], run_x[-middle:]))
-    difference_error = math.sqrt(variance * inverse_squares)
-    bends = abs(half_slopes[1] - half_slopes[0]) > max(LARGEST_BEND, 2.0 * difference_error)
+    difference_error = math.sqrt(variance * sum(1.0 / _squared_deviations(run_x[half]) for half in halves))
+    bends = abs(upper - lower) > max(LARGEST_BEND, 2.0 * difference_error)
     if bends or np.abs(residual).max() > LARGEST_RESIDUAL:
         return None
-    return PowerLawFit(slope, standard_error, intercept, first, last, half_slopes)
+    return PowerLawFit(slope, standard_error, intercept, first, last, (lower, upper))
 
 
-def _least_squares_slope(x: np.ndarray, y: np.ndarray) -> float:
-    centred_x = x - x.mean()
-    return float(centred_x @ y / (centred_x @ centred_x))
+def _squared_deviations(x: np.ndarray) -> float:
+    return float(((x - x.mean()) ** 2).sum())
 
 
 def accuracy_laws(result: StudyResult, figures: list[FigureTable] | None = None) -> list[Law]:

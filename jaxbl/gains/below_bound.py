@@ -30,9 +30,11 @@ def missing_acceleration(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarr
     return trace[f"{side}.acceleration"].to_numpy() - call_in_float64(partial(drive.acceleration, side), velocity, torque)
 
 
-def friction_rate(drive: Any, side: str) -> float:
-    """Return the viscous friction of a side over its inertia, 1/s."""
-    return float(drive.viscous(side)) / float(drive.inertia(side))
+def read_disturbance(drive: Any, side: str, trace: pd.DataFrame) -> dict[str, Any]:
+    """Return what disturbs the error of a side along a trace, as arguments of :func:`.under_tuned.simulate_error`."""
+    friction_rate = float(drive.viscous(side)) / float(drive.inertia(side))
+    missing = missing_acceleration(drive, side, trace)
+    return {"times": trace["t"].to_numpy(), "disturbance": missing, "damping": friction_rate}
 
 
 def share_of_time_above(alpha: float, disturbance: np.ndarray) -> float:
@@ -57,22 +59,17 @@ def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> 
     for index in np.unique(np.linspace(0, len(groups) - 1, _MOST_INPUTS).astype(int)):
         group = groups[index]
         config = with_values(study, {path: group[path].iloc[0] for path in inputs})
-        trace = run(config, backend="scan").trace
-        drive = config.build().drive
-        disturbance, times = missing_acceleration(drive, side, trace), trace["t"].to_numpy()
-        friction = friction_rate(drive, side)
+        disturbance = read_disturbance(config.build().drive, side, run(config, backend="scan").trace)
         for alpha, runs in group.groupby(f"observer.{side}.alpha"):
-            predicted = excursion(float(alpha), times, disturbance, friction)
-            rows.append((predicted, share_of_time_above(float(alpha), disturbance), runs, times, disturbance, friction))
-    predicted, _, runs, times, disturbance, friction = max(rows, key=lambda row: row[0])
+            share = share_of_time_above(float(alpha), disturbance["disturbance"])
+            rows.append((excursion(float(alpha), **disturbance), share, runs, disturbance))
+    predicted, _, runs, disturbance = max(rows, key=lambda row: row[0])
     # the least lambda damps the error least
     worst_run = runs.loc[runs[f"observer.{side}.lambda"].idxmin()]
     error_path = simulate_error(
         float(worst_run[f"observer.{side}.lambda"]),
         float(worst_run[f"observer.{side}.alpha"]),
-        times,
-        disturbance,
-        damping=friction,
+        **disturbance,
         velocity_error=0.0,
     )
     return {

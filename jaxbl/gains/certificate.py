@@ -293,9 +293,14 @@ def certify_best_gains(search: GainSearch, path: Path | None) -> JsonObject:
     arguments_by_side = {}
     for side in search.sides:
         best, side_table = search.best_candidate(side), _side_table(search, side)
-        arguments_by_side[side] = {"lambda_": float(best["lambda"]), "alpha": float(best["alpha"]), "runs": table.runs}
-        arguments_by_side[side] |= choose_assumptions(search, side, best["f_plus"])._asdict()
-        arguments_by_side[side] |= {"accuracy": side_table.accuracy, "reaching_time": side_table.reaching_time}
+        arguments_by_side[side] = {
+            "lambda_": float(best["lambda"]),
+            "alpha": float(best["alpha"]),
+            "runs": table.runs,
+            **choose_assumptions(search, side, best["f_plus"])._asdict(),
+            "accuracy": side_table.accuracy,
+            "reaching_time": side_table.reaching_time,
+        }
     key = {"version": version("jaxbl"), "asked": to_jsonable(arguments_by_side)}
     if path is not None:
         with suppress(FileNotFoundError, InputError):

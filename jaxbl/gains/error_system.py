@@ -90,7 +90,6 @@ def simulate_error_system(config: Config, stages: Stages) -> ErrorSystemMap:
     return ErrorSystemMap(alpha, lambda_, ratio, closed_form, boundaries.pop(0.0), boundaries)
 
 
-@cache
 def _conditions_with_q(q: float | None) -> dict[str, Condition]:
     if q is None:
         return CONDITIONS

@@ -312,9 +312,7 @@ def _reduce_to_worst(frame: pd.DataFrame, side: str, objective: str, scenario_co
     worst["scatter"] = (seeds["sem"] / seeds["mean"]).groupby(level=[0, 1]).max().fillna(0.0)
     # a maximum that leaves out failed runs is not the worst
     worst.loc[~worst["converged"], "convergence_time"] = np.nan
-    worst.loc[~worst["finite"], [*(name for name in _WORST_BY_METRIC if name not in ("converged", "finite")), "chatter"]] = (
-        np.nan
-    )
+    worst.loc[~worst["finite"], worst.columns.difference(["converged", "finite", "scatter"])] = np.nan
     return worst.rename_axis(["lambda", "alpha"]).reset_index()
 
 

@@ -25,8 +25,8 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import draw_sobol
 
 from .observer_choice import LEAST_HELD_OUT_SEEDS, GainValues, SideSearch, rank_kinds
-from .pilot import list_axes, list_scenarios
-from .stages import Stages, stage_tables
+from .pilot import list_scenarios
+from .stages import GainChoice, Stages, stage_tables
 
 GAIN_SECTIONS = "controller.", "observer.", "equivalent_control."
 """Where the gains of a loop stand."""
@@ -39,23 +39,15 @@ _COARSE, _FINE = 2.0 ** (np.arange(1, 13) / 2.0), np.arange(40)
 
 
 @dataclasses.dataclass(frozen=True)
-class LoopTuning:
+class LoopTuning(GainChoice):
     """Gains of a closed loop, tuned together.
 
     Attributes:
-        config: the study.
-        summary: plain data, as in `tuning.json`.
         candidates: one row for each set of gains tried: `stage`, gains by path, and the largest of each metric of
             `LOOP_OBJECTIVES` over all runs, infinite where one has none; `error`, infinite where a limit is not kept.
-        cost: seconds of compilation and of computing, and lanes computed in this call.
-        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
     """
 
-    config: Config
-    summary: JsonObject
     candidates: pd.DataFrame
-    cost: dict[str, float]
-    fallback_reasons: tuple[str, ...] = ()
 
 
 class LoopRuns:
@@ -80,13 +72,12 @@ class LoopRuns:
         columns = {path: np.repeat(values, corners).tolist() for path, values in gains.items()}
         columns |= {path: list(values) * count for path, values in self.scenarios.columns.items()}
         data = stage_tables(self.scenarios.config, name, self.table, held_out_seeds)
-        data["axes"] = list_axes({"trial": columns})
-        data["sweep"]["metrics"] = list(LOOP_OBJECTIVES.values())
-        rows = pd.DataFrame(columns).assign(row=range(corners * count))
-        frame = rows.merge(self.stages.run(data, name).frame, on=list(columns)).sort_values(["row", "seed"])
+        data["sweep"]["metrics"] = metrics = list(LOOP_OBJECTIVES.values())
+        names = [f"{self.side}.{metric}" for metric in metrics]
+        values = self.stages.run_trials(data, name, pd.DataFrame(columns), names).values()
         return {
-            metric: frame[f"{self.side}.{metric}"].fillna(np.inf).to_numpy(float).reshape(count, -1)
-            for metric in LOOP_OBJECTIVES.values()
+            metric: np.where(np.isnan(runs), np.inf, runs).reshape(count, -1)
+            for metric, runs in zip(metrics, values, strict=True)
         }
 
     def find_margins(self, gains: GainValues, name: str = "margins") -> JsonObject:
@@ -147,7 +138,7 @@ def tune_loop(config: Config, table: TuneTable, stages: Stages) -> LoopTuning:
         raise NoResult("tune: no gains of the loop stay finite and keep longest_settling and largest_limit_cycle")
     best = {path: float(f"{value:.6g}") for path, value in search.best.items()}
     summary = _summarise(runs, best, study_gains, search) | {"margins": runs.find_margins(best)}
-    return LoopTuning(config, to_jsonable(summary), pd.concat(tables), stages.cost, tuple(stages.fallback_reasons))
+    return LoopTuning(config, to_jsonable(summary), stages.cost, tuple(stages.fallback_reasons), pd.concat(tables))
 
 
 def _find_ranges(config: Config, table: TuneTable, runs: LoopRuns) -> dict[str, tuple[float, float]]:

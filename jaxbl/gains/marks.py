@@ -11,10 +11,10 @@ import numpy as np
 
 from jaxbl.config import Config, read_config
 from jaxbl.json_types import JsonObject
-from jaxbl.observer.conditions import CONDITIONS, peak_ratio
+from jaxbl.observer.conditions import CONDITIONS, bisect, peak_ratio
 from jaxbl.sweeps.trial import run
 
-from .below_bound import friction_rate, missing_acceleration, share_of_time_above
+from .below_bound import read_disturbance, share_of_time_above
 from .pilot import list_axes
 from .stages import Stages
 from .under_tuned import (
@@ -52,16 +52,16 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[JsonObjec
         }
         frame = stages.rerun(base | {"axes": list_axes({"marks": columns}), "sweep": {}}, "marks", side)
         starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
-        error, friction = abs(starts[1]), friction_rate(drive, side)
-        missing = missing_acceleration(drive, side, trace)
+        error, disturbance = abs(starts[1]), read_disturbance(drive, side, trace)
+        friction = disturbance["damping"]
         for mark, pair in zip(marks, pairs, strict=True):
             metrics = frame.iloc[points.index(pair)]
             bound = np.float64(metrics[f"{side}.f_plus"])
             with jax.enable_x64(True):
                 ratios = _peak_ratios(*map(np.float64, (*pair, bound, friction, error)))
             explanation = None
-            if float(ratios["peak_ratio"]) >= 1.0 and mark.alpha != 0.0 and np.isfinite(missing).all():
-                explanation = _explain_convergence(*pair, trace["t"].to_numpy(), missing, friction, starts)
+            if float(ratios["peak_ratio"]) >= 1.0 and mark.alpha != 0.0 and np.isfinite(disturbance["disturbance"]).all():
+                explanation = _explain_convergence(*pair, disturbance, starts)
             judged.append(
                 {
                     "name": mark.name,
@@ -88,22 +88,16 @@ _FALLEN_SHARE = 0.1
 
 
 def _explain_convergence(
-    lambda_: float,
-    alpha: float,
-    times: np.ndarray,
-    disturbance: np.ndarray,
-    friction: float,
-    starts: tuple[float, ...],
+    lambda_: float, alpha: float, error_inputs: dict[str, Any], starts: tuple[float, ...]
 ) -> JsonObject:
-    """Explain how gains that miss the exact condition behave under a disturbance (rad/s^2).
+    """Explain how gains that miss the exact condition behave under a disturbance (:func:`.below_bound.read_disturbance`).
 
     The numbers are predicted by :mod:`.under_tuned`, and simulated in continuous time. `starts` are the position error (rad)
     and the velocity error (rad/s) at t = 0.
     """
-    position, velocity = starts
+    (position, velocity), (times, disturbance, friction) = starts, error_inputs.values()
     largest = float(np.abs(disturbance).max())
     share = share_of_time_above(alpha, disturbance)
-    error_inputs = {"times": times, "disturbance": disturbance, "damping": friction}
     explanation: JsonObject = {"largest_disturbance": largest, "share_above_alpha": share}
     if share > 0.0:
         explanation["excursion_predicted"] = excursion(alpha, **error_inputs)
@@ -143,18 +137,13 @@ def _peak_ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, starting_
     def damped_ratio(speed: Any) -> Any:
         return half_cycle(lambda_, alpha, f_plus, damping=friction, speed=speed).ratio
 
-    def halve_range(bounds: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
-        low, high = bounds
-        middle = jnp.sqrt(low * high)
-        grows = damped_ratio(middle) >= 1.0
-        return (jnp.where(grows, middle, low), jnp.where(grows, high, middle)), None
-
     # beyond this speed friction alone brakes harder than alpha
     braking_speed = (alpha + f_plus) / jnp.maximum(friction, 1e-12)
+    least = 1e-6 * braking_speed
     # 40 halvings of seven decades: to a relative 1e-11
-    (upheld, _), _ = jax.lax.scan(halve_range, (1e-6 * braking_speed, 10.0 * braking_speed), length=40)
+    log_ratio, _ = bisect(lambda log: damped_ratio(least * jnp.exp(log)) < 1.0, jnp.full_like(least, jnp.log(1e7)), 40)
     undamped = peak_ratio(lambda_, alpha, f_plus)
-    start = jnp.where(starting_speed > 0.0, starting_speed, 1e-6 * braking_speed)
+    start = jnp.where(starting_speed > 0.0, starting_speed, least)
     constant_ratios = [
         half_cycle(lambda_, alpha, f_plus, damping=friction, speed=start, outward=sign, homeward=sign).ratio
         for sign in (1.0, -1.0)
@@ -163,5 +152,5 @@ def _peak_ratios(lambda_: Any, alpha: Any, f_plus: Any, friction: Any, starting_
         "peak_ratio": undamped,
         "peak_ratio_damped": damped_ratio(start),
         "peak_ratio_constant": jnp.sqrt(constant_ratios[0] * constant_ratios[1]),
-        "upheld_velocity_error": jnp.where(undamped < 1.0, 0.0, upheld),
+        "upheld_velocity_error": jnp.where(undamped < 1.0, 0.0, least * jnp.exp(log_ratio)),
     }

@@ -10,7 +10,9 @@ the same noise. With `tune.axes` this is done at each point of a grid.
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +27,8 @@ from jaxbl.observer import OBSERVERS, OperatingConditions
 from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points, draw_sobol
 
-from .pilot import Scenarios, list_axes, list_scenarios, run_pilot
-from .stages import Stages, stage_tables
+from .pilot import Scenarios, list_scenarios, run_pilot
+from .stages import GainChoice, Stages, describe_holdout, stage_tables
 
 TIME_CONSTANT = "equivalent_control.time_constant"
 """Searched together with the gains if the torque is the objective: its estimate is behind this low-pass."""
@@ -42,21 +44,8 @@ GainValues = dict[str, float]
 """Values of gains by config path."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ObserverChoice:
-    """Kinds of observer compared, each with tuned gains.
-
-    Attributes:
-        config: the study.
-        summary: plain data, as in `tuning.json`.
-        cost: seconds of compilation and of computing, and lanes computed in this call.
-        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
-    """
-
-    config: Config
-    summary: JsonObject
-    cost: dict[str, float]
-    fallback_reasons: tuple[str, ...] = ()
+class ObserverChoice(GainChoice):
+    """Kinds of observer compared, each with tuned gains."""
 
 
 @dataclasses.dataclass
@@ -133,13 +122,6 @@ class MapPoint(NamedTuple):
     held_out: dict[str, NamedArrays]
 
 
-class PointGroup(NamedTuple):
-    """Points with the same structure, and a config that has it."""
-
-    config: Config
-    points: list[MapPoint]
-
-
 def choose_observer(config: Config, table: TuneTable, stages: Stages) -> ObserverChoice:
     """Tune and compare the kinds `table.observers`; arguments as of :func:`.tune.tune`."""
     search = _KindSearch(config, table, stages)
@@ -159,7 +141,7 @@ class _KindSearch:
         self.seeds = config.sweep.seeds
         self.held_out_seeds = max(self.seeds, LEAST_HELD_OUT_SEEDS)
         self.groups = _group_points(config, table, stages)
-        rows = sum(len(point.scenarios.names) for group in self.groups for point in group.points)
+        rows = sum(len(point.scenarios.names) for point in chain.from_iterable(self.groups))
         runs = len(table.observers) * rows * len(self._side_sets())
         stages.total_lanes = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
 
@@ -170,58 +152,45 @@ class _KindSearch:
         """
         return [(side,) for side in self.sides] if self.table.objective == "torque" else [self.sides]
 
-    def _merge_gains(self, sides: Mapping[str, Mapping[str, Any]], side_set: tuple[str, ...]) -> JsonObject:
-        """Merge the gains of both sides for one run. A shared gain is taken from the sides that the run is for."""
-        return {path: value for side in reversed((*side_set, *self.sides)) for path, value in sides[side].items()}
-
     def tune(self, kind: str) -> None:
         """Find the gains of a kind on both sides, at all points."""
-        for group in self.groups:
-            for point in group.points:
-                point.searches[kind] = self._start_searches(kind, point, group.config)
-        for number, group in enumerate(self.groups):
-            searches = [point.searches[kind] for point in group.points]
+        for point in chain.from_iterable(self.groups):
+            point.searches[kind] = self._start_searches(kind, point)
+        for number, points in enumerate(self.groups):
+            searches = [point.searches[kind] for point in points]
             free = sum(low < high for low, high in searches[0][self.sides[0]].limits.values())
             for stage in range(1 + self.table.refine):
                 unit = draw_sobol(free, self.table.trials, stage)
                 trials = [{side: search.trial_gains(unit) for side, search in sides.items()} for sides in searches]
-                for side_set in self._side_sets():
-                    rows = []
-                    for i, sides in enumerate(trials):
-                        columns = self._merge_gains(sides, side_set)
-                        rows += [(i, {path: float(v[j]) for path, v in columns.items()}) for j in range(len(unit))]
-                    name = f"{kind}-{'-'.join(side_set)}-{number}-{stage}"
-                    errors = self._run_trials(kind, group, rows, name, side_set)
-                    for side in side_set:
-                        worst = errors[side].max(axis=1).reshape(len(searches), len(unit))
-                        for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
-                            sides[side].zoom_in(trial[side], trial_errors)
+                rows = [
+                    (point, {side: {path: float(v[j]) for path, v in gains.items()} for side, gains in sides.items()})
+                    for point, sides in zip(points, trials, strict=True)
+                    for j in range(len(unit))
+                ]
+                for side, errors in self._run_trials(kind, f"{number}-{stage}", rows).items():
+                    worst = errors.max(axis=1).reshape(len(searches), len(unit))
+                    for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
+                        sides[side].zoom_in(trial[side], trial_errors)
 
     def run_held_out(self, kind: str) -> None:
         """Find the held-out errors of a tuned kind on all sides, at all points."""
-        for number, group in enumerate(self.groups):
-            for side_set in self._side_sets():
-                rows = []
-                for i, point in enumerate(group.points):
-                    best = {side: point.searches[kind][side].best for side in self.sides}
-                    rows += [(i, self._merge_gains(best, side_set))] if all(best.values()) else []
-                if not rows:
-                    continue
-                name = f"{kind}-{'-'.join(side_set)}-{number}-holdout"
-                errors = self._run_trials(kind, group, rows, name, side_set, held_out=True)
-                for row, (i, _) in enumerate(rows):
-                    group.points[i].held_out.setdefault(kind, {}).update({side: errors[side][row] for side in side_set})
+        for number, points in enumerate(self.groups):
+            rows = [(point, {side: point.searches[kind][side].best for side in self.sides}) for point in points]
+            rows = [(point, best) for point, best in rows if all(best.values())]
+            errors = self._run_trials(kind, f"{number}-holdout", rows, held_out=True) if rows else {}
+            for i, (point, _) in enumerate(rows):
+                point.held_out[kind] = {side: errors[side][i] for side in self.sides}
 
-    def _start_searches(self, kind: str, point: MapPoint, config: Config) -> dict[str, SideSearch]:
+    def _start_searches(self, kind: str, point: MapPoint) -> dict[str, SideSearch]:
         """Start the searches of a kind at a point, one per side, with the ranges of its gains."""
-        config_there, searches = with_values(config, point.values), {}
+        config, searches = point.scenarios.config, {}
         for side in self.sides:
             bound = point.pilot[side]["f_plus"]
             if not bound > 0.0:
                 raise no_disturbance_error(side)
-            encoders = config_there.encoders.build()
+            encoders = config.encoders.build()
             noise = math.hypot(encoders.noise, _ROUNDING_RMS * encoders.resolution_of(side))
-            period = config_there.run.sample_period
+            period = config.run.sample_period
             ranges = OBSERVERS[kind].gain_ranges(OperatingConditions(bound, period, noise))
             limits = {f"observer.{side}.{gain}": ends for gain, ends in ranges.items()}
             if self.table.objective == "torque":
@@ -232,64 +201,55 @@ class _KindSearch:
     def _run_trials(
         self,
         kind: str,
-        group: PointGroup,
-        rows: Sequence[tuple[int, GainValues]],
         name: str,
-        sides: tuple[str, ...],
+        rows: Sequence[tuple[MapPoint, Mapping[str, GainValues]]],
         *,
         held_out: bool = False,
     ) -> NamedArrays:
-        """Run trials (`rows`: index of the point in its group, gains), and return errors by side, shape (rows, seeds).
+        """Run trials (`rows`: point of a group, gains by side), and return errors by side, shape (rows, seeds).
 
         They are the worst over the scenarios, and infinite if a run diverged or took too long to converge.
         """
-        columns: dict[str, list[float]] = {}
-        for i, gains in rows:
-            point = group.points[i]
-            starts = {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
-            for corner in range(len(point.scenarios.names)):
-                corner_values = {path: column[corner] for path, column in point.scenarios.columns.items()}
-                values = point.lane | starts | gains | corner_values
-                for path, value in values.items():
-                    columns.setdefault(path, []).append(value)
-        seeds = self.held_out_seeds if held_out else self.seeds
-        # gains that were rounded to the same number are run once
-        keys = list(zip(*columns.values(), strict=True))
-        unique = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-        config = group.points[0].scenarios.config
-        data = stage_tables(config, name, self.table, seeds if held_out else None)
-        data["observer"] = _observer_table(kind, data["observer"], columns)
-        data["axes"] = list_axes({"trial": dict(zip(columns, map(list, zip(*unique, strict=True)), strict=True))})
-        error_columns = [f"{side}.{self.table.objective}_rmse" for side in sides]
-        time_columns = [f"{side}.convergence_time" for side in sides] if self.table.longest_convergence is not None else []
-        frame = self.stages.run(data, name).read([*columns, "seed", *error_columns, *time_columns])
-        points = pd.DataFrame(list(unique), columns=list(columns)).assign(row=range(len(unique)))
-        frame = points.merge(frame, on=list(columns), validate="one_to_many").sort_values(["row", "seed"])
-        assert len(frame) == len(unique) * seeds
-        errors_by_side = {}
-        for i, side in enumerate(sides):
-            values = frame[error_columns[i]].to_numpy(float)
-            is_good = np.isfinite(values)
-            if time_columns:
-                is_good &= frame[time_columns[i]].to_numpy(float) <= self.table.longest_convergence
-            errors = np.where(is_good, values, np.inf).reshape(len(unique), seeds)[[unique[key] for key in keys]]
-            errors_by_side[side] = errors.reshape(len(rows), -1, seeds).max(axis=1)
+        longest, errors_by_side = self.table.longest_convergence, {}
+        names = [f"{self.table.objective}_rmse", *(["convergence_time"] if longest is not None else [])]
+        for sides in self._side_sets():
+            trials = pd.DataFrame([
+                point.lane
+                | {f"observer.{side}.velocity_error": point.pilot[side]["velocity_error"] for side in self.sides}
+                # a gain that sides share is taken from those that the runs are for
+                | {path: value for side in reversed((*sides, *self.sides)) for path, value in gains[side].items()}
+                | {path: column[corner] for path, column in point.scenarios.columns.items()}
+                for point, gains in rows
+                for corner in range(len(point.scenarios.names))
+            ])  # fmt: skip
+            stage = f"{kind}-{'-'.join(sides)}-{name}"
+            tables = stage_tables(rows[0][0].scenarios.config, stage, self.table, self.held_out_seeds if held_out else None)
+            tables["observer"] = _observer_table(kind, tables["observer"], trials.iloc[0].to_dict())
+            columns = [f"{side}.{metric}" for side in sides for metric in names]
+            metrics = self.stages.run_trials(tables, stage, trials, columns)
+            for side in sides:
+                errors = metrics[f"{side}.{names[0]}"]
+                is_good = np.isfinite(errors)
+                if longest is not None:
+                    is_good &= metrics[f"{side}.convergence_time"] <= longest
+                errors = np.where(is_good, errors, np.inf)
+                errors_by_side[side] = errors.reshape(len(rows), -1, errors.shape[1]).max(axis=1)
         return errors_by_side
 
 
-def _observer_table(kind: str, study_table: Mapping[str, Any], columns: Mapping[str, Sequence[float]]) -> JsonObject:
-    """Return the `[observer]` table of a kind, with the first trial's gains."""
+def _observer_table(kind: str, study_table: Mapping[str, Any], trial: Mapping[str, Any]) -> JsonObject:
+    """Return the `[observer]` table of a kind, with a trial's gains."""
     data: JsonObject = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)}
     data["kind"] = kind
-    for path, values in columns.items():
+    for path, value in trial.items():
         section, _, side_key = path.partition(".")
         if section == "observer":
             side, key = side_key.split(".")
-            data.setdefault(side, {"position_error": study_table[side]["position_error"]})[key] = values[0]
+            data.setdefault(side, {"position_error": study_table[side]["position_error"]})[key] = value
     return data
 
 
-def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[PointGroup]:
+def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[list[MapPoint]]:
     """Group the points of the map by what is fixed at compile time, with a pilot run for each plant."""
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
     points = Points(config.model_copy(update={"axes": table.axes, "sweep": grid}))
@@ -309,7 +269,7 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[Poin
             values = group.structural | lane
             point_values = {axis.path: values[axis.path] for axis in table.axes}
             map_points.append(MapPoint(point_values, lane, scenarios, pilots[key], {}, {}))
-        groups.append(PointGroup(group.config, map_points))
+        groups.append(map_points)
     if stored_pilots != pilots:
         stages.write_manifest(pilots=pilots)
     return groups
@@ -368,36 +328,31 @@ def _summary(search: _KindSearch) -> JsonObject:
     """Return the content of `tuning.json`."""
     config, table, points = search.config, search.table, []
     none = np.full(search.held_out_seeds, np.inf)
-    for group in search.groups:
-        for point in group.points:
-            sides = {}
-            for side in search.sides:
-                ranking = rank_kinds({kind: point.held_out.get(kind, {}).get(side, none) for kind in table.observers})
-                for kind, rank in ranking.items():
-                    rank |= _describe_search(point.searches[kind][side], side)
-                best = next(iter(ranking))
-                sides[side] = {
-                    "best": best if ranking[best]["ratio"] is not None else None,
-                    "not_told_apart": list_ties(ranking),
-                    "f_plus": point.pilot[side]["f_plus"],
-                    "kinds": ranking,
-                }
-            points.append({"values": point.values, "sides": sides})
-    first = config.sweep.first_seed + search.seeds
+    for point in chain.from_iterable(search.groups):
+        sides = {}
+        for side in search.sides:
+            ranking = rank_kinds({kind: point.held_out.get(kind, {}).get(side, none) for kind in table.observers})
+            for kind, rank in ranking.items():
+                rank |= _describe_search(point.searches[kind][side], side)
+            best = next(iter(ranking))
+            sides[side] = {
+                "best": best if ranking[best]["ratio"] is not None else None,
+                "not_told_apart": list_ties(ranking),
+                "f_plus": point.pilot[side]["f_plus"],
+                "kinds": ranking,
+            }
+        points.append({"values": point.values, "sides": sides})
+    first = config.sweep.first_seed
     summary = {
         "title": config.title,
         "objective": table.objective,
         "objective_metric": f"{table.objective}_rmse ({SIDE_METRICS[f'{table.objective}_rmse'].unit})",
         "observers": table.observers,
         "trials": table.trials * (1 + table.refine),
-        "seeds": [config.sweep.first_seed, first - 1],
-        "scenarios": search.groups[0].points[0].scenarios.names,
+        "seeds": [first, first + search.seeds - 1],
+        "scenarios": search.groups[0][0].scenarios.names,
         "axes": [axis.path for axis in table.axes],
-        "holdout": {
-            "excitation": (table.holdout or config.excitation).model_dump(by_alias=True, exclude_none=True),
-            "same_excitation": table.holdout is None,
-            "seeds": [first, first + search.held_out_seeds - 1],
-        },
+        "holdout": describe_holdout(config, table, search.held_out_seeds),
         "points": points,
     }
     if len(points) == 1:
@@ -423,17 +378,14 @@ def _describe_search(side: SideSearch, name: str) -> JsonObject:
 
 def _for_both_sides(sides: Mapping[str, Any], observers: Sequence[str]) -> str | None:
     """Return the kind with the least product of errors, as a study has one kind for both sides."""
-    total = {
-        kind: sum(math.log(summary["kinds"][kind]["ratio"]) for summary in sides.values())
-        for kind in observers
-        if all(summary["kinds"][kind]["ratio"] is not None for summary in sides.values())
-    }
-    return min(total, key=lambda kind: total[kind]) if total else None
+    ratios = {kind: [summary["kinds"][kind]["ratio"] for summary in sides.values()] for kind in observers}
+    products = {kind: math.prod(by_side) for kind, by_side in ratios.items() if None not in by_side}
+    return min(products, key=products.__getitem__, default=None)
 
 
 def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[str]:
     table, lines = search.table, []
-    names = search.groups[0].points[0].scenarios.names
+    names = search.groups[0][0].scenarios.names
     if table.worst_over_uncertainty:
         drives = "only the nominal drive was run" if len(names) == 1 else f"the worst over {len(names)} drives"
         lines.append(f"tune.worst_over_uncertainty: {drives}: {'; '.join(names)}.")
@@ -449,22 +401,20 @@ def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[s
         )
     lines.append(f"{intervals} Another input or drive may rank otherwise.")
     for side in search.sides:
-        ends: dict[tuple[str, str], int] = {}
-        unfinished: dict[str, tuple[int, float]] = {}
-        for point in points:
-            for kind, rank in point["sides"][side]["kinds"].items():
-                for key in rank["at_range_end"]:
-                    ends[kind, key] = ends.get((kind, key), 0) + 1
-                if (rank["gained_by_last_zoom"] or 0.0) > _UNFINISHED_SHARE:
-                    count, most = unfinished.get(kind, (0, 0.0))
-                    unfinished[kind] = count + 1, max(most, rank["gained_by_last_zoom"])
+        ranks = [(kind, rank) for point in points for kind, rank in point["sides"][side]["kinds"].items()]
+        ends = Counter((kind, key) for kind, rank in ranks for key in rank["at_range_end"])
+        unfinished: dict[str, list[float]] = {}
+        for kind, rank in ranks:
+            if (gained := rank["gained_by_last_zoom"] or 0.0) > _UNFINISHED_SHARE:
+                unfinished.setdefault(kind, []).append(gained)
         share = f"of {len(points)} points" if len(points) > 1 else ""
         if ends:
             gains = ", ".join(f"{kind}.{key}{f' ({n} {share})' if share else ''}" for (kind, key), n in ends.items())
             lines.append(f"{side}: best values at an end of the range searched: {gains}. Beyond it may be better ones.")
         if unfinished:
             kind_list = ", ".join(
-                f"{kind} ({f'{n} {share}, ' if share else ''}{percent(most)})" for kind, (n, most) in unfinished.items()
+                f"{kind} ({f'{len(shares)} {share}, ' if share else ''}{percent(max(shares))})"
+                for kind, shares in unfinished.items()
             )
             lines.append(
                 f"{side}: the last zoom still made errors smaller by more than {100 * _UNFINISHED_SHARE:g} %: {kind_list}. "

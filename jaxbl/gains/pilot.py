@@ -107,19 +107,15 @@ class _Extremes(NamedTuple):
 def _update_extremes(
     experiment: Experiment, extremes_by_side: dict[str, _Extremes], index: Any, signals: Signals
 ) -> dict[str, _Extremes]:
-    updated = {}
-    for side, extremes in extremes_by_side.items():
+    sizes = {}
+    for side in extremes_by_side:
         true = signals.side(side).true
         assert true is not None
         nominal = experiment.drive.acceleration(side, true.velocity, signals.input)
         missing = jnp.abs(true.acceleration - nominal)
-        updated[side] = _Extremes(
-            jnp.maximum(extremes.disturbance, missing),
-            jnp.where(index == 0, missing, extremes.at_start),
-            jnp.maximum(extremes.largest_velocity, jnp.abs(true.velocity)),
-            jnp.maximum(extremes.largest_acceleration, jnp.abs(true.acceleration)),
-        )
-    return updated
+        at_start = jnp.where(index == 0, missing, 0.0)
+        sizes[side] = _Extremes(missing, at_start, jnp.abs(true.velocity), jnp.abs(true.acceleration))
+    return jax.tree.map(jnp.maximum, extremes_by_side, sizes)
 
 
 _EXTREMES = Reducer(

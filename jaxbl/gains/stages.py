@@ -1,12 +1,14 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from jaxbl.chain import NamedArrays
 from jaxbl.cluster import Cluster, Scheduler, connect
 from jaxbl.config import Config, TuneTable
 from jaxbl.errors import InputError
@@ -17,6 +19,25 @@ from jaxbl.sweeps.programs import Backend, check_backend, share_programs
 from jaxbl.sweeps.store import claim_study, study_head
 from jaxbl.sweeps.sweep import StudyResult, sweep
 from jaxbl.workers import Progress, announce
+
+from .pilot import list_axes
+
+
+@dataclasses.dataclass(frozen=True)
+class GainChoice:
+    """Gains chosen for a study.
+
+    Attributes:
+        config: the study.
+        summary: plain data, as in `tuning.json`.
+        cost: seconds of compilation and of computing, and lanes computed in this call.
+        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
+    """
+
+    config: Config
+    summary: JsonObject
+    cost: dict[str, float]
+    fallback_reasons: tuple[str, ...]
 
 
 @contextmanager
@@ -53,6 +74,16 @@ def stage_tables(config: Config, name: str, table: TuneTable, held_out_seeds: in
         if table.holdout is not None:
             data["excitation"] = table.holdout.model_dump(by_alias=True, exclude_none=True)
     return data
+
+
+def describe_holdout(config: Config, table: TuneTable, seeds: int) -> JsonObject:
+    """Describe the held-out runs of :func:`stage_tables` for `tuning.json`."""
+    first = config.sweep.first_seed + config.sweep.seeds
+    return {
+        "excitation": (table.holdout or config.excitation).model_dump(by_alias=True, exclude_none=True),
+        "same_excitation": table.holdout is None,
+        "seeds": [first, first + seeds - 1],
+    }
 
 
 class Stages:
@@ -160,6 +191,24 @@ class Stages:
         self.fallback_reasons |= dict.fromkeys(result.fallback_reasons)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
         return result
+
+    def run_trials(self, tables: JsonObject, name: str, trials: pd.DataFrame, metrics: Sequence[str]) -> NamedArrays:
+        """Run trials as one stage.
+
+        Args:
+            tables: of the stage's study, without axes.
+            name: of the stage.
+            trials: values by path, a row for each trial; equal ones are run once.
+            metrics: columns that are wanted.
+
+        Returns:
+            Metrics by name, shape (trials, seeds).
+        """
+        paths = list(trials)
+        study = tables | {"axes": list_axes({"trial": trials.drop_duplicates().to_dict("list")})}
+        frame = self.run(study, name).read([*paths, "seed", *metrics])
+        runs = trials.assign(row=range(len(trials))).merge(frame, on=paths).sort_values(["row", "seed"])
+        return {metric: runs[metric].to_numpy(float).reshape(len(trials), -1) for metric in metrics}
 
     def rerun(self, study: Config | JsonObject, *names: str) -> pd.DataFrame:
         """Run a study beside the stages, with the fastest backend. It overwrites earlier runs in the same place.

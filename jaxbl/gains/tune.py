@@ -17,7 +17,6 @@ import pandas as pd
 from jaxbl.cluster import Scheduler
 from jaxbl.config import LOOP_OBJECTIVES, Config, ConfigSource, TuneTable, read_config
 from jaxbl.errors import InputError
-from jaxbl.json_types import JsonObject
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
@@ -27,31 +26,27 @@ from .gain_search import GainSearch
 from .loop_gains import LoopTuning, tune_loop
 from .observer_choice import ObserverChoice, choose_observer
 from .pilot import Scenarios, list_scenarios, run_pilot
-from .stages import Stages, open_stages
+from .stages import GainChoice, Stages, open_stages
 from .tune_summary import Summary
 
 
 @dataclasses.dataclass(frozen=True)
-class Tuning:
+class Tuning(GainChoice):
     """Tuned gains, and the candidates of their search.
 
     Attributes:
         config: the study.
         summary: plain data, as in `tuning.json`.
+        cost: seconds of compilation and of computing, and lanes computed in this call.
+        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
         candidates: for each side, one row for each pair of gains tried: `stage` (0 is the coarse map), `lambda`, `alpha`,
             `lambda_ratio`, `alpha_ratio`, whether all runs `converged` and are `finite`, largest `velocity_rmse`,
             `torque_rmse`, `convergence_time`, `convergence_time_worst` and `f_plus`, least `margin_alpha` and
             `margin_exact`, `error` (the objective), `chatter` of the run that has it, its `scatter` (relative standard
             error of the mean over noise seeds), and `feasible`.
-        cost: seconds of compilation and of computing, and lanes computed in this call.
-        fallback_reasons: why runs of this call were scanned although the fused backend was asked for.
     """
 
-    config: Config
-    summary: JsonObject
     candidates: dict[str, pd.DataFrame]
-    cost: dict[str, float]
-    fallback_reasons: tuple[str, ...] = ()
 
 
 def tune(
@@ -116,9 +111,8 @@ def _search_gains(config: Config, table: TuneTable, scenarios: Scenarios, stages
         stages.write_manifest(pilot=search.pilot)
     search.run()
     passed_over = {} if table.certificate is None else choose_certified_gains(search)
-    named_rows, held_out_rows = (search.compare_gains(held_out=held_out) for held_out in (False, True))
-    summary = Summary(search, named_rows, held_out_rows, search.split_error()).to_dict()
+    summary = Summary(search).to_dict()
     if table.certificate is not None:
         summary["certificates"] = certify_best_gains(search, stages.path_of("certificate.json"))
         summary["passed_over"] = passed_over
-    return Tuning(config, summary, search.candidates, stages.cost, tuple(stages.fallback_reasons))
+    return Tuning(config, summary, stages.cost, tuple(stages.fallback_reasons), search.candidates)

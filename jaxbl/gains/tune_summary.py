@@ -16,6 +16,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from .best_gains import NEARLY_AS_GOOD
 from .gain_search import GAIN_METRICS, GainSearch, Window
 from .limits import LEAST_DIFFERENCE, find_limits
+from .stages import describe_holdout
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -25,30 +26,20 @@ def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
 
 
 class Summary:
-    """The summary of a finished search.
+    """The summary of a finished search, with runs of the named gains and of the causes of the error."""
 
-    Args:
-        search: the finished search.
-        named_rows: the named gains on the study's own runs: rows of :func:`.gain_search.summarise_runs`.
-        held_out_rows: the same on the held-out runs.
-        causes: shares of the mean square error (:meth:`.gain_search.GainSearch.split_error`).
-    """
-
-    def __init__(
-        self,
-        search: GainSearch,
-        named_rows: list[JsonObject],
-        held_out_rows: list[JsonObject],
-        causes: dict[str, dict[str, float]],
-    ):
+    def __init__(self, search: GainSearch):
         self.search, self.table, self.config = search, search.table, search.scenarios.config
+        self.named_rows, self.held_out_rows = (search.compare_gains(held_out=held_out) for held_out in (False, True))
+        self.causes = search.split_error()
         self.best_candidates = {side: search.best_candidate(side) for side in search.sides}
         self.conditions = {
             side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best_candidates.items()
         }
         self.limits = {side: find_limits(search, side) for side in search.sides}
-        self.named_rows, self.held_out_rows, self.causes = named_rows, held_out_rows, causes
-        self.held_out = {side: {row["name"]: row for row in held_out_rows if row["side"] == side} for side in search.sides}
+        self.held_out = {
+            side: {row["name"]: row for row in self.held_out_rows if row["side"] == side} for side in search.sides
+        }
         self.factors = {side: self._compare_with_tuned(side) for side in search.sides}
 
     def to_dict(self) -> JsonObject:
@@ -57,7 +48,7 @@ class Summary:
         first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
         unit = SIDE_METRICS[f"{table.objective}_rmse"].unit
         keys = ("lambda", "alpha", "lambda_ratio", "alpha_ratio")
-        return {
+        return to_jsonable({
             "title": self.config.title,
             "objective": table.objective,
             "objective_metric": f"worst {table.objective}_rmse ({unit}) over seeds and scenarios",
@@ -67,7 +58,7 @@ class Summary:
             "pilot": search.pilot,
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "verdict": {side: self._judge_side(side) for side in sides},
-            "gains": {side: {key: float(self.best_candidates[side][key]) for key in keys} for side in sides},
+            "gains": {side: {key: self.best_candidates[side][key] for key in keys} for side in sides},
             "achieved": {side: self._achieved_metrics(side) for side in sides},
             "limits": self.limits,
             "conditions": self.conditions,
@@ -75,17 +66,15 @@ class Summary:
             "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cell_ratios(side).items()} for side in sides},
             "stages": [{side: _ratio_ranges(window) for side, window in windows.items()} for windows in search.windows],
             "named": self.named_rows,
-            "holdout": {
-                "excitation": (table.holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
-                "same_excitation": table.holdout is None,
-                "seeds": [first + seeds, first + 2 * seeds - 1],
-                "f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides},
-                "rows": self.held_out_rows,
-                "factors": self.factors,
+            "holdout": describe_holdout(self.config, table, seeds)
+            | {"f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides}}
+            | {"rows": self.held_out_rows, "factors": self.factors},
+            "pareto": {
+                side: pareto_front(search.candidates[side])[[*keys, "convergence_time", "error"]].to_dict("records")
+                for side in sides
             },
-            "pareto": {side: self._front(side) for side in sides},
             "remarks": [*self.config.notes, *self._remarks()],
-        }
+        })  # fmt: skip
 
     def _judge_side(self, side: str) -> JsonObject:
         """Judge whether a side's gains matter, what limits the error, and how large the margin is.
@@ -98,19 +87,22 @@ class Summary:
         factor = float(feasible["error"].max()) / best.least_error
         tolerance = max(NEARLY_AS_GOOD, float(candidates["scatter"].iloc[best.index]))
         word = "range" if best.ends else "yes" if factor > 1.0 + tolerance else "no"
-        return to_jsonable(
-            {"gains_matter": word, "worst_over_least": factor, "least_error": best.least_error}
-            | {"margin": best.margin, "margins": best.margins, "causes": self.causes[side]}
-            | {"nearly_as_good": best.nearly_as_good, "tried": len(candidates)}
-        )
+        return {
+            "gains_matter": word,
+            "worst_over_least": factor,
+            "least_error": best.least_error,
+            "margin": best.margin,
+            "margins": best.margins,
+            "causes": self.causes[side],
+            "nearly_as_good": best.nearly_as_good,
+            "tried": len(candidates),
+        }
 
     def _achieved_metrics(self, side: str) -> JsonObject:
-        names, rho = (name for name in GAIN_METRICS if name != "converged"), self.conditions[side]["peak_ratio"]
-        return to_jsonable({name: self.best_candidates[side][name] for name in names} | {"peak_ratio": rho})
-
-    def _front(self, side: str) -> list[JsonObject]:
-        names = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "convergence_time", "error"]
-        return to_jsonable(pareto_front(self.search.candidates[side])[names].to_dict("records"))
+        names = (name for name in GAIN_METRICS if name != "converged")
+        return {name: self.best_candidates[side][name] for name in names} | {
+            "peak_ratio": self.conditions[side]["peak_ratio"]
+        }
 
     def _compare_with_tuned(self, side: str) -> JsonObject:
         """Divide other gains' metrics by the tuned gains', on the held-out input.

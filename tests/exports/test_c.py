@@ -1,6 +1,9 @@
 """Exported C: bit for bit the traced step, on this machine's compilers at all levels, and near the replay in JAX."""
 
 import functools
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -364,3 +367,12 @@ def test_in_float_many_turns_away_it_is_as_good_as_near_zero(tmp_path, kind, rat
             errors = {case: np.sqrt(np.mean((values - found["double", 0]) ** 2)) for case, values in found.items()}
             allowed = 3.0 * errors["float", 0] + 1e-6 * np.ptp(found["double", 0])
             assert max(errors["float", turns] for turns in (-30_000, 10_000_000)) < allowed
+
+
+def test_the_same_study_has_the_same_code_in_each_process(tmp_path):
+    # sets of variables have another order in each process
+    study = Path(__file__).parents[2] / "sweeps" / "gain_map.toml"
+    script = "import sys, jaxbl; jaxbl.export(sys.argv[1], sys.argv[2], precision='float', name='drive')"
+    for run in ("first", "second", "third"):
+        subprocess.run([sys.executable, "-c", script, study, tmp_path / run], check=True)
+    assert len({(tmp_path / run / "drive.c").read_text() for run in ("first", "second", "third")}) == 1
