@@ -124,7 +124,7 @@ def test_a_manifest_may_not_name_files_elsewhere(count_runs, tmp_path):
 def test_drafts_of_a_killed_process_do_not_make_a_folder_anothers(count_runs, tmp_path):
     out = tmp_path / "out"
     (out / ".draft.x" / "figures").mkdir(parents=True)
-    (out / ".manifest.json.123").write_text("{")
+    (out / ".draft.123.manifest.json").write_text("{")
     (out / ".lock").touch()
     assert count_runs() == 1
     assert not list(out.rglob(".*"))

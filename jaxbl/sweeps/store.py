@@ -36,7 +36,7 @@ from jaxbl.files import (
 from jaxbl.json_types import JsonObject
 
 from . import parts
-from .parts import Damaged, PartHeader
+from .parts import PartHeader
 from .programs import Backend, Layout
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def load_config(folder: Path) -> Config:
 def _recover_study(folder: Path) -> ResultFolder | None:
     """Return the folder of a study whose manifest is lost or damaged, by its first whole part; None without one."""
     for path in list_paths(folder / "points", "part-*.parquet"):
-        with suppress(Damaged, FileNotFoundError):
+        with suppress(DamagedFile, FileNotFoundError):
             study, layout, backend, _ = parts.read_part(path, ())[0]
             subject = Subject("study", study["title"] or "untitled", study["single_run"])
             entry = study | {"layout": layout, "backend": backend, "finished": False, "files": {}, "folders": FOLDERS}
@@ -157,11 +157,10 @@ class Store:
             "folders": FOLDERS,
         }
         store = cls(results)
-        store.manifest["parts"] = len(engine)
         if engine.points.refinement is not None:
             # the files are the only record of how many parts there were if the manifest was lost
             last = max(map(store._index_of, store.list_part_files()), default=-1)
-            store.manifest["parts"] = max(len(engine), before.get("parts", 0), last + 1)
+            store.manifest["parts"] = max(store.manifest["parts"], last + 1)
         # the manifest first: it reserves the folder for this study
         results.write_manifest()
         if not is_remote(folder):
@@ -232,38 +231,32 @@ class Store:
         if the part is of another study."""
         path, folder = self.part_path(index), self.folder / "damaged"
         try:
-            return self._read(index, path, columns)
+            return self._read(index, columns)
         except FileNotFoundError:
             return None
-        except Damaged as damage:
+        except DamagedFile as damage:
             names = (f"{path.name}.{i}" if i else path.name for i in count())
             target = next(folder / name for name in names if not (folder / name).exists())
             move_file(path, target)
-            self.damaged.append(f"points/{path.name} {damage}; it is kept as damaged/{target.name}")
+            self.damaged.append(f"points/{path.name} {damage.reason}; it is kept as damaged/{target.name}")
             return None
 
-    def _read(self, index: int, path: Path, columns: Sequence[str] | None, *, check: bool = True) -> pd.DataFrame:
-        """Read columns of a chunk from a file. Raises `InputError` if it is of another study, else as `parts.read_part`."""
-        header, frame = parts.read_part(path, columns, check=check)
+    def _read(
+        self, index: int, columns: Sequence[str] | None, *, check: bool = True, copy: Path | None = None
+    ) -> pd.DataFrame:
+        """Read columns of a chunk from its file or a copy. Raises `InputError` if it is of another study, else as
+        `parts.read_part`."""
+        part = self.part_path(index)
+        header, frame = parts.read_part(copy or part, columns, check=check)
         if header.study.get("identity") != self.manifest["identity"]:
             title = header.study.get("title") or "untitled"
             raise InputError(
-                f"{self.part_path(index)}: is of another study ('{title}', other numbers); move it away, and run 'jaxbl "
+                f"{part}: is of another study ('{title}', other numbers); move it away, and run 'jaxbl "
                 "sweep' again, which computes this part"
             )
         if header.chunk != index or header.layout != self.manifest["layout"]:
-            raise Damaged(f"is part {header.chunk} of this study")
+            raise DamagedFile(part, f"is part {header.chunk} of this study", parts.RECOMPUTE)
         return frame
-
-    def _read_whole(self, index: int, path: Path, columns: Sequence[str] | None, check: bool) -> pd.DataFrame:
-        """Read as :meth:`_read` does, with an `InputError` for a part that is damaged, too."""
-        try:
-            return self._read(index, path, columns, check=check)
-        except Damaged as damage:
-            raise InputError(
-                f"{self.part_path(index)}: is damaged ({damage}); run 'jaxbl sweep' again, which moves it to damaged/ and "
-                "computes it anew"
-            ) from None
 
     def set_totals(self, parts: int, rows: int, *, final: bool = False) -> None:
         """Set the numbers of parts and rows of a refined study that have grown or are final; remove parts beyond these."""
@@ -284,7 +277,7 @@ class Store:
         Each file is compared with its checksum when it is read first, and each page whenever it is read. Raises
         `InputError` if a part is damaged, or not of this study."""
         for index in self._indices_to_read():
-            frame = self._read_whole(index, self._local_copy(index), columns, index not in self._checked)
+            frame = self._read(index, columns, check=index not in self._checked, copy=self._local_copy(index))
             self._checked.add(index)
             yield frame
 
@@ -304,7 +297,7 @@ class Store:
 
         indices = self._indices_to_read()
         for index in indices:
-            self._read_whole(index, self.part_path(index), (), check)
+            self._read(index, (), check=check)
         file_format = dataset.ParquetFileFormat(
             default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         )
@@ -323,7 +316,7 @@ class Store:
             weakref.finalize(self, shutil.rmtree, self._copy_folder, ignore_errors=True)
         copy = self._copy_folder / part.name
         if not copy.exists():
-            copy.write_bytes(part.read_bytes())
+            copy.write_bytes(parts.read_checked(part))
         return copy
 
     def verify(self) -> int:

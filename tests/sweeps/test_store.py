@@ -111,7 +111,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(study_copy, finished_study,
     elif damage == "empty":
         part.touch()
     elif damage == "draft only":
-        part.with_name(f".{part.name}.1").write_bytes(content[:100])
+        part.with_name(f".draft.1.{part.name}").write_bytes(content[:100])
     if damage in ("truncated", "empty"):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(.*\); run 'jaxbl sweep' again"):
             _ = open_study(study_copy).frame
