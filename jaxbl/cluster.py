@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
@@ -205,27 +206,25 @@ def _open_client(scheduler: str) -> "Client":
     from distributed import Client
 
     announce(f"waiting for the scheduler {scheduler}")
-    outcomes: list[Any] = [TimeoutError("nothing for as long as a scheduler takes")]
+    client: Future[Client] = Future()
 
     def open_client() -> None:
         try:
             address = str(json.loads(Path(scheduler).read_text())["address"]) if scheduler.endswith(".json") else scheduler
-            outcomes.append(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
-        # whatever answers there, it is no scheduler
+            client.set_result(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
         except Exception as error:
-            outcomes.append(error)
+            client.set_exception(error)
 
-    thread = threading.Thread(target=open_client, name="jaxbl-connect", daemon=True)
-    thread.start()
-    thread.join(_ANSWER_SECONDS + 3.0)
-    outcome = outcomes[-1]
-    if isinstance(outcome, Client):
-        return outcome
-    fault = repr(outcome) if isinstance(outcome, KeyError) else str(outcome)
-    raise InputError(
-        f"--scheduler {scheduler}: no Dask scheduler answers there ({shorten(fault.partition(chr(10))[0], 120)}); "
-        "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
-    )
+    threading.Thread(target=open_client, name="jaxbl-connect", daemon=True).start()
+    try:
+        return client.result(_ANSWER_SECONDS + 3.0)
+    # whatever answers there, it is no scheduler
+    except Exception as error:
+        fault = repr(error) if isinstance(error, KeyError) else str(error) or "nothing for as long as a scheduler takes"
+        raise InputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({shorten(fault.partition(chr(10))[0], 120)}); "
+            "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
+        ) from None
 
 
 @contextmanager

@@ -435,8 +435,7 @@ class ResultFolder:
             if not (path / MANIFEST).exists():
                 return None
         data = read_json(path / MANIFEST)
-        names = [name for entry in data.get("results", {}).values() for name in (*entry["files"], *entry.get("folders", ()))]
-        if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in names):
+        if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in _list_names(data.get("results", {}))):
             raise DamagedFile(path / MANIFEST, "names files in other folders")
         if data.get("format") != FORMAT:
             raise InputError(
@@ -484,6 +483,11 @@ class ResultFolder:
                 for file in files:
                     move_file(draft / file, self.path / file)
                 self.write_manifest()
+
+
+def _list_names(entries: JsonObject) -> list[str]:
+    """List the files and folders of all results."""
+    return [name for entry in entries.values() for name in (*entry["files"], *entry.get("folders", ()))]
 
 
 def file_checksum(path: Path) -> str:
@@ -547,9 +551,8 @@ def claim_folder(
         option = "--static" if subject.kind == "page" else "--out"
         remedy = f"choose another folder with {option}{', or --overwrite' if subject.kind in ('study', 'log') else ''}"
         raise InputError(f"{folder}: holds results of {kind} ({results.subject.name or 'untitled'}); {remedy}")
-    for entry in results.entries.values():
-        for name in (*entry["files"], *entry.get("folders", ())):
-            remove(folder / name)
+    for name in _list_names(results.entries):
+        remove(folder / name)
     remove(folder / MANIFEST)
     return ResultFolder(folder, subject)
 

@@ -200,17 +200,16 @@ def read_watch_task(
 
 def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
     units = {"half_gap": "rad", "stiffness": "N m/rad", "coulomb": "N m", "viscous": "N m s/rad"}
-    units_by_side = {}
-    for side, channel in POSITION_CHANNELS.items():
+
+    def unit_of(side: str, unit: str) -> str:
         if record is not None:
-            units_by_side[side] = {name: record.unit_of(side, unit) for name, unit in units.items()}
-        else:
-            is_linear = config.log.position_source(channel)[1].si_unit == "m"
-            units_by_side[side] = {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
+            return record.unit_of(side, unit)
+        return on_a_line(unit) if config.log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m" else unit
+
     # gap and stiffness are those of the motor's side
     return {
-        side: side_units | {name: units_by_side["motor"][name] for name in ("half_gap", "stiffness")}
-        for side, side_units in units_by_side.items()
+        side: {name: unit_of("motor" if name in ("half_gap", "stiffness") else side, unit) for name, unit in units.items()}
+        for side in POSITION_CHANNELS
     }
 
 

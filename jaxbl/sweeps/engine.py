@@ -10,7 +10,6 @@ import itertools
 import math
 import statistics
 import time
-from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -22,14 +21,16 @@ from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
-from .costs import Operations, choose_backend, count_operations, lanes_at_once, load_costs
+from .costs import Operations, Work, choose_backend, count_operations, lanes_at_once, load_costs
 from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
 from .points import Points
 from .programs import (
     BACKENDS,
+    MAX_PROGRAMS,
     Backend,
     Layout,
     Program,
+    RecentResults,
     check_backend,
     compile_program,
     computed_metrics,
@@ -99,8 +100,6 @@ _CHUNK_BYTES = 100
 """Bytes of a chunk in the list of all."""
 _LANE_BYTES = 200
 """Least bytes of a lane: its numbers, state and metrics."""
-_MAX_PROGRAMS = 16
-"""Number of compiled programs in memory; each group has one."""
 _TIMED_SAMPLES, _TIMED_SECONDS = 100, 0.5
 """Least length of the short runs that an estimate is made from; of large chunks 2000 samples take minutes."""
 _COUNTED_GROUPS = 24
@@ -120,11 +119,6 @@ def _rank_coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
         swapped = rng.integers(0, 2, 1 << level)[index >> bits - level]
         rank |= (index >> bits - 1 - level & 1 ^ swapped) << level
     return rank, np.frexp(rank)[1]
-
-
-def _slice_evenly(indices: np.ndarray, length: int) -> list[np.ndarray]:
-    """Cut indices into slices of a length; the last one may be shorter."""
-    return [indices[first : first + length] for first in range(0, len(indices), length)]
 
 
 class Engine:
@@ -157,7 +151,7 @@ class Engine:
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
-        self._programs: OrderedDict[int, Program] = OrderedDict()
+        self._programs = RecentResults()
         self._gain_metric_dtypes: set[str] = set()
         self._needs_gain_metrics = needs_gain_metrics(config.sweep.requested_metrics)
 
@@ -166,12 +160,11 @@ class Engine:
         if not self._varied_paths:
             # the fused loop does not support lanes that differ only in their seed
             return "scan"
-        layouts: dict[Backend, Layout] = {backend: self._choose_layout(backend, None) for backend in BACKENDS}
-        steps = sum(group.config.run.steps for group in self.points.groups)
-        samples: dict[Backend, int] = {
-            backend: steps * self.count_chunks(self.points.coarse_size, layout) for backend, layout in layouts.items()
-        }
-        return choose_backend(self.devices, self._operations, layouts, samples, len(self.points.groups))
+        works, steps = {}, sum(group.config.run.steps for group in self.points.groups)
+        for backend, operations in self._operations.items():
+            layout = self._choose_layout(backend, None)
+            works[backend] = Work(operations, layout, steps * self.count_chunks(self.points.coarse_size, layout))
+        return choose_backend(self.devices, works, len(self.points.groups))
 
     def _choose_layout(self, backend: Backend, chunk: int | None) -> Layout:
         """Choose the chunk shape for the number of lanes that is set, or else for the number that suits the devices."""
@@ -223,7 +216,7 @@ class Engine:
         check_cost("the list of chunks", _CHUNK_BYTES * math.prod(shape), "[sweep] chunk should be larger, or left out")
         group, seed_slice, point_slice = np.unravel_index(np.arange(math.prod(shape)), shape)
         rank, level = _rank_coarse_first(slice_count)
-        if len(self.points.groups) <= _MAX_PROGRAMS:
+        if len(self.points.groups) <= MAX_PROGRAMS:
             keys = seed_slice, level[point_slice], group, rank[point_slice]
         else:
             keys = group, seed_slice, rank[point_slice]
@@ -241,7 +234,8 @@ class Engine:
             first_index: index of the first chunk; the others count up from it.
         """
         seed_slices = map(self._seed_slice, range(self._seed_slices))
-        pairs = itertools.product(seed_slices, _slice_evenly(points, self.layout.points))
+        ends = range(self.layout.points, len(points), self.layout.points)
+        pairs = itertools.product(seed_slices, np.split(points, ends))
         return [Chunk(index, group, seeds, point_slice) for index, (seeds, point_slice) in enumerate(pairs, first_index)]
 
     @property
@@ -304,12 +298,7 @@ class Engine:
 
     def _program(self, group: int) -> Program:
         """The compiled program of a group; the last ones used stay in memory."""
-        if group not in self._programs:
-            self._programs[group] = self._compile(self.points.groups[group].config)
-        self._programs.move_to_end(group)
-        while len(self._programs) > _MAX_PROGRAMS:
-            self._programs.popitem(last=False)
-        return self._programs[group]
+        return self._programs.take(group, lambda: self._compile(self.points.groups[group].config))
 
     def _compile(self, config: Config) -> Program:
         with precision(config):

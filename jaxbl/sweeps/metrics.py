@@ -445,11 +445,11 @@ def _convergence_time(formula: Callable[..., Array]) -> Callable[[GainMetric, Ob
 
 
 def _make_margin(name: str, condition: conditions.Condition) -> type[GainMetric]:
-    def judge(self: Any, gains: ObserverGains, f_plus: Array) -> Array:
-        return gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
-
     label, doc = f"margin to {condition.title}", f"λ over the least λ of {condition.title}"
-    return GainMetric.of(f"margin_{name}", "", label, doc, judge=judge)
+    return GainMetric.of(
+        f"margin_{name}", "", label, doc,
+        judge=lambda _, gains, f_plus: gains.lambda_ / condition.least_lambda(gains.alpha, f_plus),
+    )  # fmt: skip
 
 
 for _metric in (
@@ -525,6 +525,8 @@ for _metric in (
 MetricNames = tuple[str, ...] | None
 """Names of the metrics that a study requests; None requests all."""
 
+Carries = dict[str, dict[str, Any]]
+"""States of metrics by side and name."""
 _OVERFLOW_METRICS = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
 """Metrics that overflow if the lane does: they show whether it stayed finite."""
 
@@ -565,20 +567,19 @@ def _window_start_time(experiment: Experiment) -> Number:
     return window_start(experiment.run.steps) * experiment.run.sample_period
 
 
-def _init_carries(names: MetricNames, experiment: Experiment) -> dict[str, tuple]:
+def _init_carries(names: MetricNames, experiment: Experiment) -> Carries:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    metrics = _carried_metrics(experiment, names).values()
-    return {side: tuple(metric.init(zero) for metric in metrics) for side in experiment.sides}
+    metrics = _carried_metrics(experiment, names)
+    return {side: {name: metric.init(zero) for name, metric in metrics.items()} for side in experiment.sides}
 
 
-def _are_metrics_final(names: MetricNames, experiment: Experiment, carry: tuple) -> Array | None:
+def _are_metrics_final(names: MetricNames, experiment: Experiment, carry: Mapping[str, Any]) -> Array | None:
     """True if no further sample can change any requested metric of a side; None if this cannot be told."""
     if names is None or needs_gain_metrics(names):
         return None
-    states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     start = _window_start_time(experiment)
     metrics = _loop_metrics(experiment, names)
-    flags: Any = [metric.is_final(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
+    flags: Any = [metric.is_final(carry[metric.carry or name], experiment, start) for name, metric in metrics.items()]
     return None if not flags or any(flag is None for flag in flags) else functools.reduce(jnp.logical_and, flags)
 
 
@@ -591,8 +592,8 @@ def identified_parameters(experiment: Experiment, state: State) -> Mapping[str, 
 
 
 def _update_carries(
-    names: MetricNames, experiment: Experiment, carries: dict[str, tuple], index: Int[Array, ""], signals: Signals
-) -> dict[str, tuple]:
+    names: MetricNames, experiment: Experiment, carries: Carries, index: Int[Array, ""], signals: Signals
+) -> Carries:
     """Carries after a sample, by side."""
     run = experiment.run
     inside = (index >= window_start(run.steps)).astype(signals.time.dtype)
@@ -611,8 +612,8 @@ def _update_carries(
         sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
         if signals.target is not None:
             sample = _add_following(experiment, sample, side, index, signals)
-        metrics = _carried_metrics(experiment, names).values()
-        new_carry = tuple(metric.update(state, sample) for metric, state in zip(metrics, carry, strict=True))
+        metrics = _carried_metrics(experiment, names)
+        new_carry = {name: metric.update(carry[name], sample) for name, metric in metrics.items()}
         is_final = _are_metrics_final(names, experiment, carry)
         if is_final is not None:
             # the result must not depend on whether the lane stops here: a later overflow does not count
@@ -654,41 +655,40 @@ def _add_following(
 
 
 def _compute_results(
-    names: MetricNames, experiment: Experiment, carry: tuple, state: State, side: str, result_names: Iterable[str]
+    experiment: Experiment, carry: Mapping[str, Any], state: State, side: str, names: Iterable[str]
 ) -> TracedArrays:
     """Metrics of a side by name, from its states so far."""
     run = experiment.run
     parameters = identified_parameters(experiment, state).get(side, {})
     end = SideEnd(experiment, state, _window_start_time(experiment), run.steps - window_start(run.steps), parameters)
-    states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     metrics = _select_metrics(RunMetric)
-    return {name: metrics[name].result(states[metrics[name].carry or name], end) for name in result_names}
+    return {name: metrics[name].result(carry[metrics[name].carry or name], end) for name in names}
 
 
 def _is_finite(results: TracedArrays) -> Array:
     return jnp.isfinite(sum(results[name] for name in _OVERFLOW_METRICS))
 
 
-def _is_done(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> Array:
+def _is_done(names: MetricNames, experiment: Experiment, carries: Carries, state: State) -> Array:
     """True if the requested metrics of each side are final, or the side has overflowed.
 
     A metric that has overflowed does not become finite again, and all metrics of its side are then NaN.
     """
     undecided = []
     for side, carry in carries.items():
-        finite = _is_finite(_compute_results(names, experiment, carry, state, side, _OVERFLOW_METRICS))
+        finite = _is_finite(_compute_results(experiment, carry, state, side, _OVERFLOW_METRICS))
         is_final = _are_metrics_final(names, experiment, carry)
         undecided.append(finite if is_final is None else finite & ~is_final)
     return ~functools.reduce(jnp.logical_or, undecided)
 
 
-def _finish_metrics(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> dict[str, Array]:
+def _finish_metrics(names: MetricNames, experiment: Experiment, carries: Carries, state: State) -> dict[str, Array]:
     """`finite` and the metrics of both sides by column, from the last carries."""
     columns: dict[str, Array] = {}
     all_finite = jnp.asarray(True)
     metrics = _loop_metrics(experiment, names)
     for side, carry in carries.items():
-        results = _compute_results(names, experiment, carry, state, side, dict.fromkeys([*metrics, *_OVERFLOW_METRICS]))
+        results = _compute_results(experiment, carry, state, side, dict.fromkeys([*metrics, *_OVERFLOW_METRICS]))
         finite = _is_finite(results)
         for name in metrics:
             columns[f"{side}.{name}"] = jnp.where(finite, results[name], False if name == "converged" else jnp.nan)

@@ -199,31 +199,28 @@ class Points:
                 raise InputError(
                     f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped; leave zip out, or list its values"
                 )
-        dimensions: list[AxisColumns] = []
-        zipped: dict[str, AxisColumns] = {}
+        # by label; the axes that are sampled together have none
+        dimensions: dict[str | None, AxisColumns] = {}
         for axis in config.axes:
             if axis in sampled:
                 if axis is sampled[0]:
-                    dimensions.append(_sample_points(sampled, config))
-            elif axis.zip is None:
-                dimensions.append({axis.path: axis.grid(depths.get(axis.path, 0))})
-            elif axis.zip not in zipped:
-                zipped[axis.zip] = {axis.path: axis.grid()}
-                dimensions.append(zipped[axis.zip])
-            else:
-                columns, values = zipped[axis.zip], axis.grid()
-                if len(values) != (length := _length(columns)):
-                    raise InputError(
-                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {length}; "
-                        "they should have equally many"
-                    )
-                columns[axis.path] = values
-        for label, columns in zipped.items():
+                    dimensions[None] = _sample_points(sampled, config)
+                continue
+            label = axis.path if axis.zip is None else axis.zip
+            columns = dimensions.setdefault(label, {})
+            columns[axis.path] = values = axis.grid(depths.get(axis.path, 0))
+            if len(values) != (length := _length(columns)):
+                raise InputError(
+                    f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{label}' have {length}; "
+                    "they should have equally many"
+                )
+        for label in dict.fromkeys(axis.zip for axis in config.axes if axis.zip is not None):
+            columns = dimensions[label]
             if len(columns) < 2 or label in (*self.paths, "seed"):
                 raise InputError(f"axes: zip = '{label}' should stand on two axes or more, and be neither a path nor 'seed'")
             if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < _length(columns):
                 raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
-        return dimensions
+        return list(dimensions.values())
 
 
 def _extremes(values: list[Any]) -> list[Any]:

@@ -159,8 +159,7 @@ class Store:
         store = cls(results)
         if engine.points.refinement is not None:
             # the files are the only record of how many parts there were if the manifest was lost
-            last = max(map(store._index_of, store.list_part_files()), default=-1)
-            store.manifest["parts"] = max(store.manifest["parts"], last + 1)
+            store.manifest["parts"] = max([store.manifest["parts"], *(1 + index for index in store.list_part_files().values())])
         # the manifest first: it reserves the folder for this study
         results.write_manifest()
         if not is_remote(folder):
@@ -199,32 +198,27 @@ class Store:
     def part_path(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
 
-    def list_part_files(self) -> list[Path]:
-        """All files among the parts, whole or damaged, in the order of their indices."""
-        # names with six digits come after those with five
-        return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
-
-    def _index_of(self, path: Path) -> int:
-        """Index of the part in a file, by its name; -1 if no part has that name."""
-        number = path.stem.removeprefix("part-")
-        return int(number) if number.isdecimal() and path == self.part_path(int(number)) else -1
+    def list_part_files(self) -> dict[Path, int]:
+        """All files among the parts, whole or damaged, with their indices by their names; -1 if no part has that name."""
+        indices = {}
+        for path in list_paths(self.folder / "points", "part-*.parquet"):
+            number = path.stem.removeprefix("part-")
+            is_part = number.isdecimal() and path == self.part_path(int(number))
+            indices[path] = int(number) if is_part else -1
+        return indices
 
     def list_indices(self) -> list[int]:
         """Indices of the stored parts. Raises `InputError` if a file among them is not a part of this study."""
-        indices = {path: self._index_of(path) for path in self.list_part_files()}
+        indices = self.list_part_files()
         for path, index in indices.items():
             if not 0 <= index < self.manifest["parts"]:
                 raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
-        return list(indices.values())
+        return sorted(indices.values())
 
     def write_part(self, index: int, frame: pd.DataFrame) -> None:
         """Write the rows of a chunk. The store itself does not change, so that this may run in another thread."""
         head = {name: self.manifest[name] for name in ("identity", "single_run", "title")}
         parts.write_part(self.part_path(index), frame, PartHeader(head, self.manifest["layout"], self.backend, index))
-
-    def has_part(self, index: int) -> bool:
-        """True if the part of a chunk is stored and whole. Otherwise as :meth:`read_part`."""
-        return self.read_part(index, ()) is not None
 
     def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:
         """Read columns of a chunk; None if its part is not stored. A damaged one is moved to `damaged/`. Raises `InputError`
@@ -263,8 +257,8 @@ class Store:
         if final or rows > self.manifest["rows"]:
             self.update_manifest(parts=parts, rows=rows)
         if final:
-            for path in self.list_part_files():
-                if self._index_of(path) >= parts:
+            for path, index in self.list_part_files().items():
+                if index >= parts:
                     path.unlink()
 
     def columns(self) -> list[str]:
@@ -322,7 +316,7 @@ class Store:
     def verify(self) -> int:
         """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones. Raises `InputError`
         if a part is of another study, or has an index that this study does not have."""
-        whole_parts = sum(map(self.has_part, self._indices_to_read()))
+        whole_parts = sum(self.read_part(index, ()) is not None for index in self._indices_to_read())
         if self.damaged:
             self.update_manifest(finished=False)
         return whole_parts
