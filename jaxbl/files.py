@@ -435,7 +435,8 @@ class ResultFolder:
             if not (path / MANIFEST).exists():
                 return None
         data = read_json(path / MANIFEST)
-        if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in _list_names(data.get("results", {}))):
+        paths = map(PurePath, _list_names(data.get("results", {})))
+        if any(file.is_absolute() or ".." in file.parts for file in paths):
             raise DamagedFile(path / MANIFEST, "names files in other folders")
         if data.get("format") != FORMAT:
             raise InputError(

@@ -191,7 +191,9 @@ class Window:
     ) -> dict[str, Quantity] | None:
         """Solve for the numbers with standard errors, and the shift of the twist's zero; None where not determined."""
         # of all blocks, and of all but each
-        coefficients = _solve(*(sums.sum(axis=0) - np.stack([np.zeros_like(sums[0]), *sums]) for sums in (information, right)))
+        coefficients = _solve(
+            *(sums.sum(axis=0) - np.concatenate([np.zeros_like(sums[:1]), sums]) for sums in (information, right))
+        )
         if coefficients is None:
             return None
         values, *jackknife = (self._name_coefficients(side, law, theta) for theta in coefficients)

@@ -152,7 +152,6 @@ class Engine:
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
         self._programs = RecentResults()
-        self._gain_metric_dtypes: set[str] = set()
         self._needs_gain_metrics = needs_gain_metrics(config.sweep.requested_metrics)
 
     def _choose_backend(self) -> Backend:
@@ -325,9 +324,8 @@ class Engine:
         return add_gain_metrics(metrics, gains) if self._needs_gain_metrics else metrics
 
     def _compile_gain_metrics(self, dtype: str) -> None:
-        """Compile the gain metrics for a precision, unless that is done or none are requested."""
-        if dtype not in self._gain_metric_dtypes and self._needs_gain_metrics:
-            self._gain_metric_dtypes.add(dtype)
+        """Compile the gain metrics for a precision, unless none are requested."""
+        if self._needs_gain_metrics:
             start = time.perf_counter()
             compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)
             self.compile_seconds += time.perf_counter() - start

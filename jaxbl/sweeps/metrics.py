@@ -9,6 +9,7 @@ run, in SI units. Position and velocity tolerances of the load are those of the 
 import abc
 import functools
 from collections.abc import Callable, Iterable, Mapping
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -466,32 +467,32 @@ for _metric in (
         judge=_convergence_time(conditions.convergence_time_worst),
     ),
     Rms.of("position_rmse", "rad", "position error, rms", "rms position error", better="less",
-           signal=lambda _, sample: sample.position_error),
+           signal=attrgetter("position_error")),
     Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", better="less",
-           signal=lambda _, sample: sample.velocity_error),
+           signal=attrgetter("velocity_error")),
     Rms.of(
         "torque_rmse", "N m", "torque error, rms",
         "rms error of the transmitted torque from this side's equivalent control",
         better="less",
-        signal=lambda _, sample: sample.torque_error,
+        signal=attrgetter("torque_error"),
     ),
     Rms.of(
         "position_size", "rad", "position, rms", "rms true position: the size that its errors compare with",
-        signal=lambda _, sample: sample.true.position,
+        signal=attrgetter("true.position"),
     ),
     Rms.of(
         "velocity_size", "rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with",
-        signal=lambda _, sample: sample.true.velocity,
+        signal=attrgetter("true.velocity"),
     ),
     Chatter,
     Peak.of(
         "f_plus", "rad/s²", "true bound f⁺", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run",
-        signal=lambda _, sample: sample.true.perturbation,
+        signal=attrgetter("true.perturbation"),
     ),
     Peak.of(
         "f_plus_acceleration", "rad/s²", "twice the largest acceleration",
         "twice the largest acceleration: the paper's text for f⁺",
-        signal=lambda _, sample: sample.true.acceleration,
+        signal=attrgetter("true.acceleration"),
         factor=2.0,
     ),
     GainMetric.of(
@@ -506,9 +507,9 @@ for _metric in (
     ),
     Excitation,
     Rms.of("following_rmse", "rad", "following error, rms", "rms difference of reference and true position",
-           better="less", closed_loop=True, signal=lambda _, sample: sample.following_error),
+           better="less", closed_loop=True, signal=attrgetter("following_error")),
     Peak.of("following_peak", "rad", "following error, peak", "largest difference of reference and true position",
-            better="less", closed_loop=True, signal=lambda _, sample: sample.following_error),
+            better="less", closed_loop=True, signal=attrgetter("following_error")),
     SettlingTime,
     LimitCycleAmplitude,
     LimitCycleFrequency,
@@ -517,7 +518,7 @@ for _metric in (
     ImpactSpeed,
     Rms.of("torque_rms", "N m", "driving torque, rms",
            "rms torque that drives the side (motor: the input; load: through the gear)",
-           better="less", closed_loop=True, signal=lambda _, sample: sample.driving_torque),
+           better="less", closed_loop=True, signal=attrgetter("driving_torque")),
 ):  # fmt: skip
     SIDE_METRICS.add(_metric)
 
@@ -758,8 +759,9 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[first], index
 
 
+@functools.cache
 def compile_gain_metrics(dtype: str, lanes: int) -> None:
-    """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision; all studies share it."""
+    """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision, once; all studies share it."""
     apply_elementwise(compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 

@@ -159,7 +159,8 @@ class Store:
         store = cls(results)
         if engine.points.refinement is not None:
             # the files are the only record of how many parts there were if the manifest was lost
-            store.manifest["parts"] = max([store.manifest["parts"], *(1 + index for index in store.list_part_files().values())])
+            last = max(store.list_part_files().values(), default=-1)
+            store.manifest["parts"] = max(store.manifest["parts"], last + 1)
         # the manifest first: it reserves the folder for this study
         results.write_manifest()
         if not is_remote(folder):

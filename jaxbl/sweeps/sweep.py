@@ -229,7 +229,7 @@ def _make_engine(study: ConfigSource, backend: Backend | None, devices: list[Any
 
 def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
     totals = run.totals
-    cost = {"compile_seconds": totals.compile_seconds, "run_seconds": totals.run_seconds, "lanes": totals.lanes}
+    cost = {name: getattr(totals, name) for name in ("compile_seconds", "run_seconds", "lanes")}
     return StudyResult(run.engine.config, source, cost, totals.fallback_reasons, totals.damaged)
 
 
