@@ -2,6 +2,7 @@
 file and says what the results are about."""
 
 import errno
+import functools
 import json
 import math
 import os
@@ -91,9 +92,9 @@ class DamagedFile(InputError):
         self.reason = reason
 
 
-def checksum(content: bytes) -> str:
+def checksum(*pieces: bytes | memoryview) -> str:
     """Return the CRC-32 of some bytes, 8 hexadecimal digits: it detects damage, not forgery."""
-    return f"{zlib.crc32(content):08x}"
+    return f"{functools.reduce(lambda crc, piece: zlib.crc32(piece, crc), pieces, 0):08x}"
 
 
 def read_json(path: Path) -> JsonObject:
@@ -126,7 +127,7 @@ _DRAFT = ".draft."
 """The names of all files and folders that a killed process may leave behind begin so."""
 
 
-def write_atomic(path: Path, content: str | bytes) -> None:
+def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
     """Write a file so that it exists either whole or not at all. Raises as :func:`catch_write_errors`."""
     # file names in the text may have bytes that are no UTF-8; they are escaped as JSON escapes them
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content

@@ -403,18 +403,16 @@ class Watcher:
             number = numbers_by_side[side][key]
             ends = (number.value + sign * INTERVAL * number.standard_error for sign in (-1.0, 1.0))
             values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
-        bounds = {
-            side: numbers[name].value - _BOUND * numbers[name].standard_error for side, numbers in numbers_by_side.items()
-        }
         differing = [
             key
             for key in self._chosen
             if len(numbers_by_side) == 2 and _surely_differ(*(numbers[key] for numbers in numbers_by_side.values()))
         ]
         values["contradiction"] = bool(differing)
-        # where the gaps differ one of them is wrong: the smaller one counts
-        bound = min(bounds.values()) if name in differing else bounds[side]
         if name == "half_gap":
+            # where the gaps differ one of them is wrong: the smaller one counts
+            counted = numbers_by_side.values() if name in differing else [numbers_by_side[side]]
+            bound = min(numbers[name].value - _BOUND * numbers[name].standard_error for numbers in counted)
             values |= {"half_gap_least": bound, "alarm": task.alarm_gap is not None and bound > task.alarm_gap}
         return values
 

@@ -22,7 +22,7 @@ from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
 from .costs import Operations, Work, choose_backend, count_operations, lanes_at_once, load_costs
-from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
+from .metrics import ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
 from .points import Points
 from .programs import (
     BACKENDS,
@@ -84,14 +84,15 @@ def layout_for(config: Config, points: Points, count: int, capacity: int) -> Lay
         # a batch has few points and needs all their seeds; each device still gets 64 points of a chunk
         seeds = min(config.sweep.seeds, max(capacity // (64 * count), 1))
         return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
+    size = points.group_size
     # chunks of equal size need little padding; devices share the points or else the seeds, in a multiple of their number
-    per_chunk = math.ceil(points.group_size / math.ceil(points.group_size / capacity))
-    if points.group_size >= count and points.group_size > 1:
+    per_chunk = math.ceil(size / math.ceil(size / capacity))
+    if size >= count and size > 1:
         per_chunk = max(math.ceil(per_chunk / count), 2) * count
     seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
-    if points.group_size == 1:
+    if size == 1:
         seeds = max(math.ceil(seeds / count), 2) * count
-    elif points.group_size < count:
+    elif size < count:
         seeds = math.ceil(seeds / count) * count
     return Layout(seeds, per_chunk)
 
@@ -175,11 +176,16 @@ class Engine:
     @functools.cached_property
     def _operations(self) -> dict[Backend, Operations]:
         """Operations of a sample by backend, in the group with most samples."""
-        config = max(self.points.groups, key=lambda group: group.config.run.steps).config
-        requested = config.sweep.requested_metrics
-        names: dict[Backend, MetricNames] = {backend: computed_metrics(backend, requested) for backend in BACKENDS}
-        operations = {computed: count_operations(config, self._varied_paths, computed) for computed in set(names.values())}
-        return {backend: operations[computed] for backend, computed in names.items()}
+        return {backend: self._count_operations(backend, self._longest_config) for backend in BACKENDS}
+
+    @property
+    def _longest_config(self) -> Config:
+        """The study of the group with most samples."""
+        return max((group.config for group in self.points.groups), key=lambda config: config.run.steps)
+
+    def _count_operations(self, backend: Backend, config: Config) -> Operations:
+        """Count the operations of a sample in a group."""
+        return count_operations(config, self._varied_paths, computed_metrics(backend, config.sweep.requested_metrics))
 
     @property
     def _varied_paths(self) -> list[str]:
@@ -284,7 +290,7 @@ class Engine:
         """Arguments of a compiled program, padded to the layout: values by path, and seeds."""
 
         def pad(values: np.ndarray, size: int) -> np.ndarray:
-            return np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)])
+            return np.pad(values, (0, size - len(values)), "edge")
 
         dtype = config.run.precision
         padded = {path: pad(np.asarray(column, dtype), self.layout.points) for path, column in columns.items()}
@@ -332,9 +338,7 @@ class Engine:
 
     def estimate(self) -> "SweepEstimate":
         """Estimate memory and time of all chunks, by a compilation and short runs of the group with most samples."""
-        groups = self.points.groups
-        group = max(range(len(groups)), key=lambda index: groups[index].config.run.steps)
-        config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
+        groups, config, chunk = self.points.groups, self._longest_config, self.chunk(0)
         with without_cache_writes():
             program = self._compile(config)
             program_seconds = self.compile_seconds
@@ -378,7 +382,7 @@ class Engine:
 
     def _predict_seconds(self, backend: Backend, config: Config) -> float:
         """Seconds that a chunk of a group should take."""
-        operations = count_operations(config, self._varied_paths, computed_metrics(backend, config.sweep.requested_metrics))
+        operations = self._count_operations(backend, config)
         return load_costs(self.devices).sample_seconds(backend, operations, self.layout) * config.run.steps
 
 

@@ -402,7 +402,7 @@ class LimitCycleAmplitude(RunMetric):
     closed_loop = True
 
     def init(self, zero):
-        return LimitCycle(zero + jnp.inf, zero - jnp.inf, zero + jnp.inf, zero - jnp.inf, *[zero] * 5)
+        return LimitCycle(*[zero + jnp.inf, zero - jnp.inf] * 2, *[zero] * 5)
 
     def update(self, carry, sample):
         error, before, inside = sample.following_error, sample.before > 0.0, sample.inside > 0.0
@@ -725,7 +725,10 @@ def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
     observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
     if not all(isinstance(observer, AbstractSuperTwisting) for observer in observers.values()):
         return {}
-    return {s: ObserverGains(*(getattr(observers[s], field) for field in ObserverGains._fields)) for s in observers}
+    return {
+        side: ObserverGains(*(getattr(observer, field) for field in ObserverGains._fields))
+        for side, observer in observers.items()
+    }
 
 
 def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> NamedArrays:
@@ -738,17 +741,14 @@ def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]
         gains: gains by side, of shapes that broadcast to that.
     """
     columns = {name: np.asarray(metric) for name, metric in metrics.items()}
-    if not gains:
-        return columns
-    f_plus = np.stack([columns[f"{side}.f_plus"] for side in gains])
-    arguments = [[np.asarray(gain, f_plus.dtype) for gain in sides] for sides in zip(*gains.values(), strict=True)]
-    for side, *side_arguments in zip(gains, *arguments, f_plus, strict=True):
-        rows = np.stack([np.broadcast_to(argument, f_plus.shape[1:]).ravel() for argument in side_arguments], axis=1)
+    for side, side_gains in gains.items():
+        f_plus = columns[f"{side}.f_plus"]
+        arguments = (np.broadcast_to(argument, f_plus.shape).ravel() for argument in (*side_gains, f_plus))
         # lanes share the numbers that no axis varies
-        unique, row_index = _unique_rows(rows)
+        unique, row_index = _unique_rows(np.stack([*arguments], axis=1, dtype=f_plus.dtype))
         # the program that the study's chunks have compiled, however few of the rows differ
-        results = apply_elementwise(compute_gain_metrics, list(unique.T), largest=f_plus[0].size)
-        columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape[1:]) for name, result in results.items()}
+        results = apply_elementwise(compute_gain_metrics, list(unique.T), largest=f_plus.size)
+        columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape) for name, result in results.items()}
     return columns
 
 

@@ -52,15 +52,18 @@ def write_part(path: Path, frame: pd.DataFrame, header: PartHeader) -> None:
     file = BytesIO()
     # dictionaries of values that hardly repeat would take most of the time
     pq.write_table(table, file, write_page_checksum=True, use_dictionary=False)
-    write_atomic(path, _with_checksum(file.getvalue()))
+    content = bytearray(file.getbuffer())
+    place, expected = _find_checksum(content)
+    content[place] = expected
+    write_atomic(path, content)
 
 
-def _with_checksum(content: bytes) -> bytes:
-    """Return a file's content with the checksum that it should have."""
+def _find_checksum(content: bytes | bytearray) -> tuple[slice, bytes]:
+    """Return the place of a file's checksum, and what it should be."""
     # after the key come the type and the length of the value
-    place = content.rfind(_SUM) + len(_SUM) + 2
-    before, after = content[:place], content[place + len(_NO_SUM) :]
-    return before + checksum(before + _NO_SUM + after).encode() + after
+    start = content.rfind(_SUM) + len(_SUM) + 2
+    place, view = slice(start, start + len(_NO_SUM)), memoryview(content)
+    return place, checksum(view[: place.start], _NO_SUM, view[place.stop :]).encode()
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool = True) -> tuple[PartHeader, pd.DataFrame]:
@@ -98,6 +101,7 @@ def read_checked(path: Path) -> bytes:
         content = path.read_bytes()
     if _SUM not in content:
         raise DamagedFile(path, "has no header that names its study and chunk", RECOMPUTE)
-    if content != _with_checksum(content):
+    place, expected = _find_checksum(content)
+    if content[place] != expected:
         raise DamagedFile(path, "does not agree with its checksum", RECOMPUTE)
     return content

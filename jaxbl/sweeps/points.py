@@ -72,8 +72,8 @@ class Points:
         refined = self._refined_paths(config)
         depth = config.sweep.refine or 0
         self.dimensions = dimensions = self._build_dimensions(config, dict.fromkeys(refined, depth))
-        structural = [columns for columns in dimensions if not all(path in self.leaves for path in columns)]
-        self._leaf_dimensions = [columns for columns in dimensions if all(path in self.leaves for path in columns)]
+        structural = [columns for columns in dimensions if not self.leaves.issuperset(columns)]
+        self._leaf_dimensions = [columns for columns in dimensions if self.leaves.issuperset(columns)]
         self.group_size = _count_points(self._leaf_dimensions)
         self.refinement: Refinement | None = None
         self.coarse_size = self.group_size
@@ -144,8 +144,8 @@ class Points:
     @staticmethod
     def _build_kinds(config: Config, base: Config) -> list[Experiment]:
         """An experiment with each kind of observer, where that is an axis; all must have the gains that other axes vary."""
-        kinds = [axis.values or [] for axis in config.axes if axis.path == KIND]
-        variants = [with_values(base, {KIND: kind}) for kind in (kinds[0] if kinds else ())]
+        kinds = (kind for axis in config.axes if axis.path == KIND for kind in axis.values or ())
+        variants = [with_values(base, {KIND: kind}) for kind in kinds]
         for variant in variants:
             valid = numeric_paths(variant)
             for i, axis in enumerate(config.axes):

@@ -178,15 +178,14 @@ def _compile_fused(
         raise Unsupported("lanes that differ only in their seed")
     from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
-    if devices[0].platform == "cpu":
-        simulator: LaneSimulator = HostSimulator(experiment, (metrics_reducer(names),), paths, layout.points, len(devices))
-    elif devices[0].platform == "gpu" and len(devices) == 1:
-        with jax.default_device(devices[0]):
-            simulator = DeviceSimulator(experiment, (metrics_reducer(names),), paths, layout.points)
-    else:
-        raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
-
+    arguments = experiment, (metrics_reducer(names),), paths, layout.points
     with jax.default_device(devices[0]):
+        if devices[0].platform == "cpu":
+            simulator: LaneSimulator = HostSimulator(*arguments, len(devices))
+        elif devices[0].platform == "gpu" and len(devices) == 1:
+            simulator = DeviceSimulator(*arguments)
+        else:
+            raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
         # compile the program that draws the noise, now and not with the first chunk
         next(simulator.compute_inputs(0))
 
