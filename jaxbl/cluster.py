@@ -74,16 +74,16 @@ class Cluster:
         """Results of a function (importable by name), in the order of its arguments."""
         results: dict[int, Result] = {}
         following = 0
-        for index, result in self.run_jobs(function, enumerate(jobs)):
+        for index, _, result in self.run_jobs(function, jobs):
             results[index] = result
             while following in results:
                 yield results.pop(following)
                 following += 1
 
     def run_jobs(
-        self, function: Callable[[Job], Result], jobs: Iterable[tuple[Any, Job]], poll: Callable[[], object] = lambda: None
-    ) -> Iterator[tuple[Any, Result]]:
-        """Run named jobs on the workers, and yield the name and result of each job that has ended.
+        self, function: Callable[[Job], Result], jobs: Iterable[Job], poll: Callable[[], object] = lambda: None
+    ) -> Iterator[tuple[int, Job, Result]]:
+        """Run jobs on the workers, and yield the number, argument and result of each job that has ended.
 
         Jobs begin in their order; if a worker is lost, another one runs its job again. `jobs` is read as workers become
         free, and `poll` is called from time to time meanwhile.
@@ -93,7 +93,7 @@ class Cluster:
         """
         from distributed import as_completed
 
-        waiting, begun = iter(jobs), {}
+        waiting, begun = enumerate(jobs), {}
         finished = as_completed(loop=self._client.loop)
         most, next_count, last_worker = 0, 0.0, time.monotonic()
         try:
@@ -111,7 +111,7 @@ class Cluster:
                         announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
-                begun |= {future.key: (name, future) for future, (name, _) in zip(futures, more, strict=True)}
+                begun |= {future.key: (*numbered, future) for future, numbered in zip(futures, more, strict=True)}
                 finished.update(futures)
                 # what is not referred to any more, the scheduler forgets
                 del futures
@@ -119,14 +119,14 @@ class Cluster:
                     return
                 batch = list(finished.next_batch(block=False))
                 for future in batch:
-                    name, _ = begun.pop(future.key)
-                    yield name, self._result(future)
+                    index, job, _ = begun.pop(future.key)
+                    yield index, job, self._result(future)
                 poll()
                 if not batch:
                     time.sleep(_POLL_SECONDS)
         finally:
             if begun and self._client.status == "running":
-                self._client.cancel([future for _, future in begun.values()], force=True)
+                self._client.cancel([future for *_, future in begun.values()], force=True)
 
     def submit_jobs(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
         """Have jobs done without waiting for them, also when this process has ended."""

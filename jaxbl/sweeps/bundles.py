@@ -87,8 +87,7 @@ class ClusterRun(StudyRun):
 
     def _compute_bundles(self, bundles: Iterable[Bundle]) -> None:
         """Have workers compute bundles."""
-        jobs = ((bundle, bundle) for bundle in bundles)
-        for bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, jobs, self._poll_parts):
+        for _, bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, bundles, self._poll_parts):
             for chunk in _chunks_of(self.engine, bundle):
                 _wait_for_part(self.store.part_path(chunk.index), host)
                 self.count_chunk(chunk)

@@ -334,11 +334,11 @@ class _MatchedMetric:
 
     def __init__(self, metric: str, first: _MatchedStudy, second: _MatchedStudy, paired: bool):
         a, b = first.read_metric(metric), second.read_metric(metric)
-        self.only = (0, 0)
+        self.only: Any = (0, 0)
         if paired:
             finite = np.isfinite(a) & np.isfinite(b)
             stored = (first.row_index >= 0) & (second.row_index >= 0)
-            self.only = int((np.isfinite(a) & ~finite & stored).sum()), int((np.isfinite(b) & ~finite & stored).sum())
+            self.only = tuple(int((np.isfinite(values) & ~finite & stored).sum()) for values in (a, b))
             a, b = np.where(finite, a, np.nan), np.where(finite, b, np.nan)
         self.first, self.second = a, b
         self.means = _row_means(a), _row_means(b)

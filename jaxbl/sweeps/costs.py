@@ -139,7 +139,7 @@ def lanes_at_once(devices: Sequence[Any], backend: Backend, operations: Operatio
 
 
 class Work(NamedTuple):
-    """What a study takes by a backend.
+    """The work of a study by a backend.
 
     Attributes:
         operations: operations of a sample.

@@ -491,6 +491,27 @@ def test_a_study_in_an_object_store_is_read_alike(finished_study):
         pd.testing.assert_frame_equal(table, finished_study[1].frame[[ALPHA, "seed"]])
 
 
+def test_a_store_that_does_not_answer_has_no_damage(finished_study, monkeypatch):
+    """It was taken for damage, and moving the part aside ended in a traceback."""
+    address = UPath("memory://silent/study")
+    for name, content in read_files(finished_study[0]).items():
+        (address / name).write_bytes(content)
+    read = type(address).read_bytes
+
+    def refuse_parts(path):
+        if path.suffix == ".parquet":
+            raise ConnectionError("timed out")
+        return read(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(address), "read_bytes", refuse_parts)
+        for call in (lambda: sweep(study(), str(address)), lambda: open_study(str(address)).frame):
+            with pytest.raises(InputError, match=r"part-00000\.parquet: cannot be read \(timed out\); name another folder"):
+                call()
+    assert not (address / "damaged").exists()
+    pd.testing.assert_frame_equal(open_study(str(address)).frame, finished_study[1].frame)
+
+
 def test_the_metrics_asked_for_are_a_sweeps_own():
     def of(command, *names):
         return identity(read_config(rigid_study(sweep={"metrics": list(names)} if names else {})), command)
