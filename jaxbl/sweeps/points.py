@@ -79,11 +79,9 @@ class Points:
         self.coarse_size = self.group_size
         if refined:
             is_refined = [next(iter(columns)) in refined for columns in self._leaf_dimensions]
-            fine_sizes = [_length(columns) for columns in self._leaf_dimensions]
-            sizes = [(n - 1 >> depth) + 1 if halved else n for n, halved in zip(fine_sizes, is_refined, strict=True)]
-            self.coarse_size = math.prod(sizes)
-            criterion = _build_criterion(config, base, metrics, refined)
-            self.refinement = Refinement(refined, CellGrid(sizes, is_refined, depth), criterion)
+            grid = CellGrid([*map(_length, self._leaf_dimensions)], is_refined, depth)
+            self.coarse_size = math.prod(grid.coarse_sizes)
+            self.refinement = Refinement(refined, grid, _build_criterion(config, base, metrics, refined))
         runs_per_point = _count_points(structural) * config.sweep.seeds
         if (runs := runs_per_point * self.coarse_size) > _MAX_RUNS:
             raise InputError(f"axes: {runs:.2g} runs are more than {_MAX_RUNS:.0e}; fewer values, or a quasi-random design")

@@ -53,20 +53,20 @@ class CellGrid:
     that of its lower corner.
 
     Args:
-        sizes: vertices of the coarse grid along each axis, last axis fastest.
+        sizes: vertices along each axis, last axis fastest.
         is_refined: for each axis, True if its cells are halved.
         depth: number of times that they are halved.
     """
 
     def __init__(self, sizes: Sequence[int], is_refined: Sequence[bool], depth: int):
         self.depth = depth
-        self.coarse_sizes = tuple(sizes)
-        self.sizes = tuple((n - 1 << depth) + 1 if halved else n for n, halved in zip(sizes, is_refined, strict=True))
-        refined, fine_sizes = np.array(is_refined, bool), np.array(self.sizes, np.int64)
+        self.sizes = tuple(sizes)
+        self.coarse_sizes = tuple((n - 1 >> depth) + 1 if halved else n for n, halved in zip(sizes, is_refined, strict=True))
+        refined, fine_sizes = np.array(is_refined, bool), np.array(sizes, np.int64)
         steps = np.cumprod([1, *fine_sizes[:0:-1]], dtype=np.int64)[::-1][: len(sizes)]
         # flat distance of neighbours on the coarse grid, and number of cells on it, along each axis
         self._strides = np.where(refined, steps << depth, steps)
-        self._coarse_cell_counts = (np.array(sizes, np.int64) - refined).tolist()
+        self._coarse_cell_counts = (np.array(self.coarse_sizes, np.int64) - refined).tolist()
         # of the refined axes alone: flat distance of neighbours on the fine grid, and number of vertices
         self._steps, self._sizes = steps[refined].tolist(), fine_sizes[refined].tolist()
 
