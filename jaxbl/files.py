@@ -89,7 +89,11 @@ class DamagedFile(InputError):
         remedy: str = "begin anew with --overwrite, or choose another folder with --out",
     ):
         super().__init__(f"{path}: is damaged ({reason}); {remedy}")
-        self.reason = reason
+        self.reason, self._arguments = reason, (path, reason, remedy)
+
+    def __reduce__(self) -> Any:
+        # it may come from another process
+        return DamagedFile, self._arguments
 
 
 def checksum(*pieces: bytes | memoryview) -> str:

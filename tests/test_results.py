@@ -2,13 +2,15 @@
 
 import json
 import os
+import pickle
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from jaxbl.errors import InputError
-from jaxbl.files import MANIFEST, ResultFolder, lock_folder, read_result, run_or_read
+from jaxbl.files import MANIFEST, DamagedFile, ResultFolder, lock_folder, read_result, run_or_read
 
 
 @pytest.fixture
@@ -97,6 +99,12 @@ def test_a_damaged_manifest_is_made_anew_or_refused(count_runs, tmp_path, case):
             ):
                 read()
         assert count_runs(overwrite=damaged_summary) == count + 1 == count_runs()
+
+
+def test_damage_is_told_by_other_processes_too():
+    fault = DamagedFile(Path("a"), "cut off", "write it again")
+    copy = pickle.loads(pickle.dumps(fault))
+    assert str(copy) == str(fault) == "a: is damaged (cut off); write it again" and copy.reason == "cut off"
 
 
 def test_a_folder_in_place_of_the_manifest_is_refused(count_runs, tmp_path):
