@@ -143,10 +143,9 @@ def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
         try:
             draft.write_bytes(data)
             draft.replace(path)
-        except BaseException:
+        finally:
             with suppress(OSError):
                 draft.unlink()
-            raise
 
 
 def write_json(path: Path, data: Any, *, allow_nan: bool = True) -> None:
@@ -379,16 +378,16 @@ def catch_store_errors(path: Path, action: str) -> Iterator[None]:
 def make_folder(path: Path, remedy: str = "choose another folder with --out") -> None:
     """Make a folder, which may exist, and check that it can be written to. Raises `InputError`, which ends with the remedy,
     if that is not possible."""
+    probe = path / f"{_DRAFT}{os.getpid()}"
     if is_remote(path):
         with catch_store_errors(path, "written to"):
-            (path / ".probe").write_bytes(b"")
-            (path / ".probe").unlink()
+            probe.write_bytes(b"")
+            probe.unlink()
         return
     try:
         # Parquet's library takes names in UTF-8 alone
         str(path).encode()
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f"{_DRAFT}{os.getpid()}"
         probe.touch()
         probe.unlink()
     except UnicodeEncodeError:
