@@ -60,10 +60,10 @@ class Job(NamedTuple):
     seconds: float
 
 
-def jobs(count: int, seconds: float) -> Iterator[tuple[int, Job]]:
+def jobs(count: int, seconds: float) -> Iterator[Job]:
     for index in range(count):
         chunks = tuple(range(_PARTS * index, _PARTS * (index + 1)))
-        yield index, Job("/scratch/study", "0123456789abcdef", (4, 4096), chunks, seconds)
+        yield Job("/scratch/study", "0123456789abcdef", (4, 4096), chunks, seconds)
 
 
 def done(job: Job) -> tuple[dict[int, str], float, str]:
@@ -168,7 +168,7 @@ class Pass:
 
     def submit_unending(self, client: Client, bundles: int) -> None:
         """Hand over bundles of which none ends, until the scheduler knows them all."""
-        Cluster(client, local=False).submit_jobs(done, [job for _, job in jobs(bundles, 1e6)])
+        Cluster(client, local=False).submit_jobs(done, list(jobs(bundles, 1e6)))
         self.first = time.perf_counter() - self.start
         while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) < bundles:
             time.sleep(0.5)

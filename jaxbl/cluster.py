@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
@@ -73,16 +74,16 @@ class Cluster:
         """Results of a function (importable by name), in the order of its arguments."""
         results: dict[int, Result] = {}
         following = 0
-        for index, result in self.run_jobs(function, enumerate(jobs)):
+        for index, _, result in self.run_jobs(function, jobs):
             results[index] = result
             while following in results:
                 yield results.pop(following)
                 following += 1
 
     def run_jobs(
-        self, function: Callable[[Job], Result], jobs: Iterable[tuple[Any, Job]], poll: Callable[[], object] = lambda: None
-    ) -> Iterator[tuple[Any, Result]]:
-        """Run named jobs on the workers, and yield the name and result of each job that has ended.
+        self, function: Callable[[Job], Result], jobs: Iterable[Job], poll: Callable[[], object] = lambda: None
+    ) -> Iterator[tuple[int, Job, Result]]:
+        """Run jobs on the workers, and yield the number, argument and result of each job that has ended.
 
         Jobs begin in their order; if a worker is lost, another one runs its job again. `jobs` is read as workers become
         free, and `poll` is called from time to time meanwhile.
@@ -92,7 +93,7 @@ class Cluster:
         """
         from distributed import as_completed
 
-        waiting, begun = iter(jobs), {}
+        waiting, begun = enumerate(jobs), {}
         finished = as_completed(loop=self._client.loop)
         most, next_count, last_worker = 0, 0.0, time.monotonic()
         try:
@@ -110,7 +111,7 @@ class Cluster:
                         announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
-                begun |= {future.key: (name, future) for future, (name, _) in zip(futures, more, strict=True)}
+                begun |= {future.key: (*numbered, future) for future, numbered in zip(futures, more, strict=True)}
                 finished.update(futures)
                 # what is not referred to any more, the scheduler forgets
                 del futures
@@ -118,14 +119,14 @@ class Cluster:
                     return
                 batch = list(finished.next_batch(block=False))
                 for future in batch:
-                    name, _ = begun.pop(future.key)
-                    yield name, self._result(future)
+                    index, job, _ = begun.pop(future.key)
+                    yield index, job, self._result(future)
                 poll()
                 if not batch:
                     time.sleep(_POLL_SECONDS)
         finally:
             if begun and self._client.status == "running":
-                self._client.cancel([future for _, future in begun.values()], force=True)
+                self._client.cancel([future for *_, future in begun.values()], force=True)
 
     def submit_jobs(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
         """Have jobs done without waiting for them, also when this process has ended."""
@@ -205,27 +206,25 @@ def _open_client(scheduler: str) -> "Client":
     from distributed import Client
 
     announce(f"waiting for the scheduler {scheduler}")
-    outcomes: list[Any] = [TimeoutError("nothing for as long as a scheduler takes")]
+    client: Future[Client] = Future()
 
     def open_client() -> None:
         try:
             address = str(json.loads(Path(scheduler).read_text())["address"]) if scheduler.endswith(".json") else scheduler
-            outcomes.append(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
-        # whatever answers there, it is no scheduler
+            client.set_result(Client(address, timeout=_ANSWER_SECONDS, set_as_default=False))
         except Exception as error:
-            outcomes.append(error)
+            client.set_exception(error)
 
-    thread = threading.Thread(target=open_client, name="jaxbl-connect", daemon=True)
-    thread.start()
-    thread.join(_ANSWER_SECONDS + 3.0)
-    outcome = outcomes[-1]
-    if isinstance(outcome, Client):
-        return outcome
-    fault = repr(outcome) if isinstance(outcome, KeyError) else str(outcome)
-    raise InputError(
-        f"--scheduler {scheduler}: no Dask scheduler answers there ({shorten(fault.partition(chr(10))[0], 120)}); "
-        "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
-    )
+    threading.Thread(target=open_client, name="jaxbl-connect", daemon=True).start()
+    try:
+        return client.result(_ANSWER_SECONDS + 3.0)
+    # whatever answers there, it is no scheduler
+    except Exception as error:
+        fault = repr(error) if isinstance(error, KeyError) else str(error) or "nothing for as long as a scheduler takes"
+        raise InputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({shorten(fault.partition(chr(10))[0], 120)}); "
+            "it should be an address (tcp://host:8786), a scheduler's file (….json), or local:N"
+        ) from None
 
 
 @contextmanager

@@ -2,10 +2,10 @@
 file and says what the results are about."""
 
 import errno
+import functools
 import json
 import math
 import os
-import re
 import shutil
 import signal
 import socket
@@ -73,16 +73,32 @@ def to_jsonable(value: Any) -> Any:
     return None if isinstance(scalar, float) and not math.isfinite(scalar) else scalar
 
 
-_BEGIN_ANEW = "begin anew with --overwrite, or choose another folder with --out"
-
-
 class DamagedFile(InputError):
-    """A file is not what was written."""
+    """A file is not what was written.
+
+    Args:
+        path: of the file.
+        reason: what is wrong with it.
+        remedy: how it is mended.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        reason: str,
+        remedy: str = "begin anew with --overwrite, or choose another folder with --out",
+    ):
+        super().__init__(f"{path}: is damaged ({reason}); {remedy}")
+        self.reason, self._arguments = reason, (path, reason, remedy)
+
+    def __reduce__(self) -> Any:
+        # it may come from another process
+        return DamagedFile, self._arguments
 
 
-def checksum(content: bytes) -> str:
+def checksum(*pieces: bytes | memoryview) -> str:
     """Return the CRC-32 of some bytes, 8 hexadecimal digits: it detects damage, not forgery."""
-    return f"{zlib.crc32(content):08x}"
+    return f"{functools.reduce(lambda crc, piece: zlib.crc32(piece, crc), pieces, 0):08x}"
 
 
 def read_json(path: Path) -> JsonObject:
@@ -97,7 +113,7 @@ def read_json(path: Path) -> JsonObject:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = str(error) if isinstance(error, OSError | ValueError) else "has no checksum"
-    raise DamagedFile(f"{path}: is damaged ({reason}); {_BEGIN_ANEW}")
+    raise DamagedFile(path, reason)
 
 
 def json_with_checksum(data: JsonObject) -> str:
@@ -111,11 +127,15 @@ def _json_checksum(data: JsonObject) -> str:
     return checksum(json.dumps(data, sort_keys=True).encode())
 
 
+_DRAFT = ".draft."
+"""The names of all files and folders that a killed process may leave behind begin so."""
+
+
 def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
     """Write a file so that it exists either whole or not at all. Raises as :func:`catch_write_errors`."""
     # file names in the text may have bytes that are no UTF-8; they are escaped as JSON escapes them
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = path.with_name(f"{_DRAFT}{os.getpid()}.{path.name}")
     with catch_write_errors(path):
         if is_remote(path):
             path.write_bytes(data)
@@ -123,10 +143,9 @@ def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
         try:
             draft.write_bytes(data)
             draft.replace(path)
-        except BaseException:
+        finally:
             with suppress(OSError):
                 draft.unlink()
-            raise
 
 
 def write_json(path: Path, data: Any, *, allow_nan: bool = True) -> None:
@@ -194,8 +213,6 @@ def hold_interrupts() -> Iterator[None]:
 
 
 _LOCK_NAME = ".lock"
-_DRAFT_NAME = re.compile(r"\.((probe|.+\.(json|toml|parquet|html|png|csv))\.\d+|draft\..+)")
-"""Names of files and folders that a killed process may leave behind."""
 held_folders: list[Path] = []
 """Folders that this process has locked: an interrupt has something to tidy up."""
 
@@ -342,9 +359,8 @@ def _try_lock_bytes(file: Any, shared: bool) -> bool:
 def _remove_drafts(folder: Path) -> None:
     """Remove the drafts that killed processes have left in a folder that is locked."""
     for place in ("", "points", "verify", "tune"):
-        for draft in list_paths(folder / place, ".*"):
-            if _DRAFT_NAME.fullmatch(draft.name):
-                remove(draft)
+        for draft in list_paths(folder / place, f"{_DRAFT}*"):
+            remove(draft)
 
 
 @contextmanager
@@ -362,16 +378,16 @@ def catch_store_errors(path: Path, action: str) -> Iterator[None]:
 def make_folder(path: Path, remedy: str = "choose another folder with --out") -> None:
     """Make a folder, which may exist, and check that it can be written to. Raises `InputError`, which ends with the remedy,
     if that is not possible."""
+    probe = path / f"{_DRAFT}{os.getpid()}"
     if is_remote(path):
         with catch_store_errors(path, "written to"):
-            (path / ".probe").write_bytes(b"")
-            (path / ".probe").unlink()
+            probe.write_bytes(b"")
+            probe.unlink()
         return
     try:
         # Parquet's library takes names in UTF-8 alone
         str(path).encode()
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".probe.{os.getpid()}"
         probe.touch()
         probe.unlink()
     except UnicodeEncodeError:
@@ -423,9 +439,9 @@ class ResultFolder:
             if not (path / MANIFEST).exists():
                 return None
         data = read_json(path / MANIFEST)
-        names = [name for entry in data.get("results", {}).values() for name in (*entry["files"], *entry.get("folders", ()))]
-        if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in names):
-            raise DamagedFile(f"{path / MANIFEST}: is damaged (names files in other folders); {_BEGIN_ANEW}")
+        paths = map(PurePath, _list_names(data.get("results", {})))
+        if any(file.is_absolute() or ".." in file.parts for file in paths):
+            raise DamagedFile(path / MANIFEST, "names files in other folders")
         if data.get("format") != FORMAT:
             raise InputError(
                 f"{path / MANIFEST}: has format {data.get('format')}; this version reads {FORMAT}; read it with the jaxbl "
@@ -457,7 +473,7 @@ class ResultFolder:
         """Yield an empty folder; what is written there appears in this one when the `with` block ends, with the manifest,
         and takes the place of the files of an earlier result of that name. Raises as :func:`write_atomic`."""
         place = None if is_remote(self.path) else self.path
-        with catch_write_errors(self.path), TemporaryDirectory(prefix=".draft.", dir=place) as name:
+        with catch_write_errors(self.path), TemporaryDirectory(prefix=_DRAFT, dir=place) as name:
             draft = Path(name)
             yield draft
             files = {file.relative_to(draft).as_posix(): file_checksum(file) for file in draft.rglob("*") if file.is_file()}
@@ -472,6 +488,11 @@ class ResultFolder:
                 for file in files:
                     move_file(draft / file, self.path / file)
                 self.write_manifest()
+
+
+def _list_names(entries: JsonObject) -> list[str]:
+    """List the files and folders of all results."""
+    return [name for entry in entries.values() for name in (*entry["files"], *entry.get("folders", ()))]
 
 
 def file_checksum(path: Path) -> str:
@@ -525,19 +546,18 @@ def claim_folder(
                 f"{folder}: is not empty and holds no results with a {MANIFEST} (an earlier jaxbl wrote none there); choose "
                 "another folder with --out, where they are made anew"
             )
-        remove(folder / MANIFEST)
-        return ResultFolder(folder, subject)
-    same = all(results.entries.get(name, {}).get("identity") in (None, identity) for name, identity in asked)
-    if same and (results.subject.kind, results.subject.identity) == (subject.kind, subject.identity):
+        results = ResultFolder(folder, subject)
+    elif results.subject._replace(name=subject.name) == subject and all(
+        results.entries.get(name, {}).get("identity") in (None, identity) for name, identity in asked
+    ):
         return results
-    if not overwrite:
+    elif not overwrite:
         kind = f"another {subject.kind}" if results.subject.kind == subject.kind else f"a {results.subject.kind}"
         option = "--static" if subject.kind == "page" else "--out"
         remedy = f"choose another folder with {option}{', or --overwrite' if subject.kind in ('study', 'log') else ''}"
         raise InputError(f"{folder}: holds results of {kind} ({results.subject.name or 'untitled'}); {remedy}")
-    for entry in results.entries.values():
-        for name in (*entry["files"], *entry.get("folders", ())):
-            remove(folder / name)
+    for name in _list_names(results.entries):
+        remove(folder / name)
     remove(folder / MANIFEST)
     return ResultFolder(folder, subject)
 
@@ -582,7 +602,7 @@ def run_or_read(
     """
     with open_results(file.parent, log_subject(task.record.path), overwrite=overwrite) as results:
         if results.is_whole(file.name, task.identity):
-            return json.loads(file.read_bytes())
+            return read_result(file)
         result = run(task)
         write(result, results)
     return result.summary

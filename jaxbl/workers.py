@@ -141,15 +141,11 @@ def map_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], processes: 
             if not all(future.done() for future in futures):
                 for future in futures:
                     future.cancel()
-                for child in multiprocessing.active_children():
-                    _interrupt_process(child)
-
-
-def _interrupt_process(child: Any) -> None:
-    """Interrupt a process. On Windows, Ctrl+C has reached all processes of the terminal by itself."""
-    if os.name != "nt":
-        with suppress(ProcessLookupError):
-            os.kill(child.pid, signal.SIGINT)
+                # on Windows, Ctrl+C has reached all processes of the terminal by itself
+                children: Any = () if os.name == "nt" else multiprocessing.active_children()
+                for child in children:
+                    with suppress(ProcessLookupError):
+                        os.kill(child.pid, signal.SIGINT)
 
 
 @contextmanager

@@ -2,13 +2,15 @@
 
 import json
 import os
+import pickle
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from jaxbl.errors import InputError
-from jaxbl.files import MANIFEST, ResultFolder, lock_folder, read_result, run_or_read
+from jaxbl.files import MANIFEST, DamagedFile, ResultFolder, lock_folder, read_result, run_or_read
 
 
 @pytest.fixture
@@ -99,6 +101,12 @@ def test_a_damaged_manifest_is_made_anew_or_refused(count_runs, tmp_path, case):
         assert count_runs(overwrite=damaged_summary) == count + 1 == count_runs()
 
 
+def test_damage_is_told_by_other_processes_too():
+    fault = DamagedFile(Path("a"), "cut off", "write it again")
+    copy = pickle.loads(pickle.dumps(fault))
+    assert str(copy) == str(fault) == "a: is damaged (cut off); write it again" and copy.reason == "cut off"
+
+
 def test_a_folder_in_place_of_the_manifest_is_refused(count_runs, tmp_path):
     count_runs()
     (tmp_path / "out" / MANIFEST).unlink()
@@ -124,7 +132,7 @@ def test_a_manifest_may_not_name_files_elsewhere(count_runs, tmp_path):
 def test_drafts_of_a_killed_process_do_not_make_a_folder_anothers(count_runs, tmp_path):
     out = tmp_path / "out"
     (out / ".draft.x" / "figures").mkdir(parents=True)
-    (out / ".manifest.json.123").write_text("{")
+    (out / ".draft.123.manifest.json").write_text("{")
     (out / ".lock").touch()
     assert count_runs() == 1
     assert not list(out.rglob(".*"))

@@ -160,7 +160,7 @@ class Stages:
         path, manifest = self.path_of(name), study_head(self._config, self._command)
         if path is None:
             return compute()
-        with suppress(FileNotFoundError, parts.Damaged):
+        with suppress(FileNotFoundError, parts.DamagedFile):
             header, frame = parts.read_part(path)
             if header.study.get("identity") == manifest["identity"]:
                 return frame

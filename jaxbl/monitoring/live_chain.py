@@ -58,21 +58,16 @@ class LiveChain:
             first = {side: jnp.asarray(values[0]) for side, values in measured.items()}
             self._state = initial_state(self._experiment, first)
         blocks: list[NamedArrays] = []
-        done = 0
-        while done < len(torque):
-            remaining = len(torque) - done
-            size = next((block for block in BLOCKS if remaining <= block), BLOCKS[-1])
-            part, count = slice(done, done + size), min(remaining, size)
-
-            def pad_block(values: np.ndarray, part: slice = part, padding: int = size - count) -> jax.Array:
-                return jnp.asarray(np.pad(values[part], (0, padding)))
-
-            block_inputs = pad_block(torque), {side: pad_block(values) for side, values in measured.items()}
-            self._state, rows = _run_block(self._experiment, self._state, *block_inputs, jnp.asarray(count))
+        for start in range(0, len(torque), BLOCKS[-1]):
+            count = min(len(torque) - start, BLOCKS[-1])
+            size = next(block for block in BLOCKS if count <= block)
+            parts = (values[start : start + count] for values in (torque, *measured.values()))
+            torque_block, *positions = (jnp.asarray(np.pad(part, (0, size - count))) for part in parts)
+            measured_block = dict(zip(measured, positions, strict=True))
+            self._state, rows = _run_block(self._experiment, self._state, torque_block, measured_block, jnp.asarray(count))
             blocks.append({name: np.asarray(values)[:count] for name, values in rows.items()})
-            done += count
-        positions = {f"{side}.position": values for side, values in measured.items()}
-        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]} | positions
+        motion = {f"{side}.position": values for side, values in measured.items()}
+        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]} | motion
 
     def compile(self) -> None:
         """Compile what rows will need, before any come."""

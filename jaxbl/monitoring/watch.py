@@ -200,17 +200,16 @@ def read_watch_task(
 
 def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
     units = {"half_gap": "rad", "stiffness": "N m/rad", "coulomb": "N m", "viscous": "N m s/rad"}
-    units_by_side = {}
-    for side, channel in POSITION_CHANNELS.items():
+
+    def unit_of(side: str, unit: str) -> str:
         if record is not None:
-            units_by_side[side] = {name: record.unit_of(side, unit) for name, unit in units.items()}
-        else:
-            is_linear = config.log.position_source(channel)[1].si_unit == "m"
-            units_by_side[side] = {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
+            return record.unit_of(side, unit)
+        return on_a_line(unit) if config.log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m" else unit
+
     # gap and stiffness are those of the motor's side
     return {
-        side: side_units | {name: units_by_side["motor"][name] for name in ("half_gap", "stiffness")}
-        for side, side_units in units_by_side.items()
+        side: {name: unit_of("motor" if name in ("half_gap", "stiffness") else side, unit) for name, unit in units.items()}
+        for side in POSITION_CHANNELS
     }
 
 
@@ -404,18 +403,16 @@ class Watcher:
             number = numbers_by_side[side][key]
             ends = (number.value + sign * INTERVAL * number.standard_error for sign in (-1.0, 1.0))
             values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
-        bounds = {
-            side: numbers[name].value - _BOUND * numbers[name].standard_error for side, numbers in numbers_by_side.items()
-        }
         differing = [
             key
             for key in self._chosen
             if len(numbers_by_side) == 2 and _surely_differ(*(numbers[key] for numbers in numbers_by_side.values()))
         ]
         values["contradiction"] = bool(differing)
-        # where the gaps differ one of them is wrong: the smaller one counts
-        bound = min(bounds.values()) if name in differing else bounds[side]
         if name == "half_gap":
+            # where the gaps differ one of them is wrong: the smaller one counts
+            counted = numbers_by_side.values() if name in differing else [numbers_by_side[side]]
+            bound = min(numbers[name].value - _BOUND * numbers[name].standard_error for numbers in counted)
             values |= {"half_gap_least": bound, "alarm": task.alarm_gap is not None and bound > task.alarm_gap}
         return values
 

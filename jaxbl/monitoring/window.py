@@ -90,15 +90,15 @@ def _sum_blocks(
 
 
 def _solve(information: np.ndarray, right: np.ndarray) -> np.ndarray | None:
-    """Solve normal equations; None where they are not determined."""
-    size = np.sqrt(np.diag(information))
+    """Solve normal equations `(n, p, p)` and `(n, p)`; None where any of them are not determined."""
+    size = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     if not (np.isfinite(size).all() and (size > 0.0).all()):
         return None
-    scaled = information / np.outer(size, size)
-    scaled[-2, -2] += _CONSTANT_TORQUE_WEIGHT
-    if np.linalg.eigvalsh(scaled)[0] < _SINGULAR:
+    scaled = information / (size[:, :, None] * size[:, None, :])
+    scaled[:, -2, -2] += _CONSTANT_TORQUE_WEIGHT
+    if np.linalg.eigvalsh(scaled).min() < _SINGULAR:
         return None
-    return np.linalg.solve(scaled, right / size) / size
+    return np.linalg.solve(scaled, (right / size)[..., None])[..., 0] / size
 
 
 class Window:
@@ -190,16 +190,13 @@ class Window:
         self, side: str, law: AbstractTransmission, information: np.ndarray, right: np.ndarray
     ) -> dict[str, Quantity] | None:
         """Solve for the numbers with standard errors, and the shift of the twist's zero; None where not determined."""
-        all_coefficients = _solve(information.sum(axis=0), right.sum(axis=0))
-        if all_coefficients is None:
+        # of all blocks, and of all but each
+        coefficients = _solve(
+            *(sums.sum(axis=0) - np.concatenate([np.zeros_like(sums[:1]), sums]) for sums in (information, right))
+        )
+        if coefficients is None:
             return None
-        jackknife = []
-        for i in range(BLOCKS):
-            coefficients = _solve(information.sum(axis=0) - information[i], right.sum(axis=0) - right[i])
-            if coefficients is None:
-                return None
-            jackknife.append(self._name_coefficients(side, law, coefficients))
-        values = self._name_coefficients(side, law, all_coefficients)
+        values, *jackknife = (self._name_coefficients(side, law, theta) for theta in coefficients)
         numbers = {}
         for name, number in values.items():
             jackknife_values = np.array([part[name] for part in jackknife])

@@ -39,15 +39,12 @@ class Bundle(NamedTuple):
     Attributes:
         folder: folder of the study.
         identity: identity of the study in its manifest.
-        layout, backend: layout and backend of the store.
         require_backend: refuse a study that the fused loop cannot run.
         chunks: indices of the chunks; of a refined study, the chunks themselves.
     """
 
     folder: str
     identity: str
-    layout: Layout
-    backend: Backend
     require_backend: bool
     chunks: tuple[int | Chunk, ...]
 
@@ -60,24 +57,37 @@ class ClusterRun(StudyRun):
         NoResult: the cluster is lost.
     """
 
-    def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None):
+    def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None = None):
         super().__init__(engine, store, progress)
         self._cluster = cluster
         self._next_poll = time.monotonic() + _POLL_SECONDS
 
     def compute_missing(self, chunks: Iterable[Chunk]) -> None:
+        self._compute_bundles(self._compute_first(chunks, max(self._cluster.workers, 1)))
+
+    def submit_missing(self) -> None:
+        """Have workers compute all missing chunks, waiting for the first alone."""
+        bundles = self._compute_first(map(self.engine.chunk, self.engine.chunk_order()), 1)
+        self._cluster.submit_jobs(compute_bundle, list(bundles))
+
+    def _compute_first(self, chunks: Iterable[Chunk], count: int) -> Iterator[Bundle]:
+        """Have so many of the missing chunks computed, which shows how long a chunk takes, and bundle the other ones."""
         # the points of all chunks would be 8 GB in a study of 10^9
         missing = [chunk.index if self.engine.points.refinement is None else chunk for chunk in self.missing_chunks(chunks)]
-        # the first chunks, one for each worker, show how long a chunk takes
-        workers, before = max(self._cluster.workers, 1), self.totals.run_seconds
-        self._compute_bundles(missing[:workers], 1)
-        size = _bundle_size((self.totals.run_seconds - before) / workers, len(missing[workers:]), workers)
-        self._compute_bundles(missing[workers:], size)
+        first, following, before = missing[:count], missing[count:], self.totals.run_seconds
+        self._compute_bundles(self._make_bundles(first, 1))
+        seconds, workers = (self.totals.run_seconds - before) / count, max(self._cluster.workers, 1)
+        return self._make_bundles(following, _bundle_size(seconds, len(following), workers))
 
-    def _compute_bundles(self, chunks: Sequence[int | Chunk], size: int) -> None:
-        """Have workers compute chunks, in bundles of a size."""
-        jobs = ((bundle, bundle) for bundle in _make_bundles(self.engine, self.store, chunks, size))
-        for bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, jobs, self._poll_parts):
+    def _make_bundles(self, chunks: Sequence[int | Chunk], size: int) -> Iterator[Bundle]:
+        """Make bundles of `size` chunks each."""
+        study = str(self.store.folder.absolute()), self.store.manifest["identity"], self.engine.require_backend
+        for first in range(0, len(chunks), size):
+            yield Bundle(*study, tuple(chunks[first : first + size]))
+
+    def _compute_bundles(self, bundles: Iterable[Bundle]) -> None:
+        """Have workers compute bundles."""
+        for _, bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, bundles, self._poll_parts):
             for chunk in _chunks_of(self.engine, bundle):
                 _wait_for_part(self.store.part_path(chunk.index), host)
                 self.count_chunk(chunk)
@@ -92,27 +102,11 @@ class ClusterRun(StudyRun):
             self._next_poll = time.monotonic() + max(_POLL_SECONDS, 10.0 * (time.monotonic() - start))
 
 
-def submit_chunks(cluster: Cluster, engine: Engine, store: Store) -> None:
-    """Have a cluster compute all missing chunks of a study, waiting for the first alone. Raises as :class:`ClusterRun`."""
-    missing = [index for index in engine.chunk_order() if not store.has_part(index)]
-    results = cluster.map_jobs(compute_bundle, _make_bundles(engine, store, missing[:1], 1))
-    size = _bundle_size(sum(totals.run_seconds for totals, _ in results), len(missing[1:]), max(cluster.workers, 1))
-    cluster.submit_jobs(compute_bundle, list(_make_bundles(engine, store, missing[1:], size)))
-
-
 def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
     """Number of chunks of a bundle, if a chunk takes so many seconds and so many chunks are missing."""
     by_time = int(_BUNDLE_SECONDS / max(seconds, 1e-3))
     by_worker = math.ceil(chunks / (workers * _BUNDLES_PER_WORKER))
     return max(min(by_time, by_worker), math.ceil(chunks / _MAX_BUNDLES), 1)
-
-
-def _make_bundles(engine: Engine, store: Store, chunks: Sequence[int | Chunk], size: int) -> Iterator[Bundle]:
-    """Make bundles of `size` chunks each."""
-    folder = str(store.folder.absolute())
-    empty = Bundle(folder, store.manifest["identity"], store.layout, store.backend, engine.require_backend, ())
-    for first in range(0, len(chunks), size):
-        yield empty._replace(chunks=tuple(chunks[first : first + size]))
 
 
 def _chunks_of(engine: Engine, bundle: Bundle) -> list[Chunk]:
@@ -141,7 +135,7 @@ def compute_bundle(bundle: Bundle) -> tuple[RunTotals, str]:
         store = Store.open(folder)
         if store.manifest["identity"] != bundle.identity:
             raise InputError(f"{folder}: holds another study by now; begin again with another --out")
-        engine = _cached_engine(*bundle[:-1])
+        engine = _cached_engine(bundle.folder, bundle.identity, store.layout, store.backend, bundle.require_backend)
         engine.compile_seconds = engine.run_seconds = 0.0
         run = StudyRun(engine, store)
         run.compute_missing(_chunks_of(engine, bundle))

@@ -148,8 +148,7 @@ class Comparison:
 
     def to_dict(self) -> JsonObject:
         """The comparison as plain data for `comparison.json`."""
-        fields = (field.name for field in dataclasses.fields(self) if not field.name.startswith("_"))
-        table = {name: getattr(self, name) for name in fields}
+        table = {name: entry for name, entry in vars(self).items() if not name.startswith("_")}
         table["points"] = dict(zip(("both", "first_only", "second_only"), self.points, strict=True))
         table["metrics"] = [
             dataclasses.asdict(change) | {"moved": change.moved._asdict(), "only": list(change.only)}
@@ -183,7 +182,7 @@ def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -
         InputError: a folder holds no study, or a part of it is damaged.
     """
     studies = [study if isinstance(study, StudyResult) else open_study(study) for study in (first, second)]
-    names = _study_names(first, second)
+    names = _study_names(*studies)
     paths = list(dict.fromkeys(axis.path for study in studies for axis in study.config.axes))
     matched, point_counts, seed_count, paired = _match_points(studies, paths)
     columns = [name for name in studies[0].columns if name in studies[1].columns and name not in (*paths, "seed")]
@@ -213,14 +212,12 @@ def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -
     )
 
 
-def _study_names(first: Any, second: Any) -> tuple[str, str]:
+def _study_names(*studies: StudyResult) -> tuple[str, str]:
     """Names of the studies: their folders, or their titles."""
-    names = []
-    for ordinal, study in zip(("first", "second"), (first, second), strict=True):
-        if isinstance(study, StudyResult):
-            names.append(str(study.source.folder) if isinstance(study.source, Store) else study.config.title or ordinal)
-        else:
-            names.append(str(study))
+    names = [
+        str(study.source.folder) if isinstance(study.source, Store) else study.config.title or ordinal
+        for ordinal, study in zip(("first", "second"), studies, strict=True)
+    ]
     return (names[0], names[1]) if names[0] != names[1] else (f"{names[0]} (first)", f"{names[1]} (second)")
 
 
@@ -297,15 +294,11 @@ def _match_points(
     paired = len(common_seeds) >= 2 or min(map(len, seeds)) < 2
     matched = []
     for study, frame, code, study_seeds in zip(studies, frames, codes, seeds, strict=True):
-        used_seeds = common_seeds if paired else study_seeds
-        point, seed = np.searchsorted(common_points, code), np.searchsorted(used_seeds, frame["seed"])
-        is_common = np.isin(code, common_points)
-        is_used = is_common & np.isin(frame["seed"], used_seeds)
-        row_index = np.full((len(common_points), len(used_seeds)), -1)
-        row_index[point[is_used], seed[is_used]] = np.flatnonzero(is_used)
-        row_of_point = np.zeros(len(common_points), int)
-        row_of_point[point[is_common]] = np.flatnonzero(is_common)
-        matched.append(_MatchedStudy(study, len(frame), row_index, frame.loc[row_of_point, paths]))
+        runs = frame.assign(point=code, row=np.arange(len(frame)))
+        rows = runs.drop_duplicates(["point", "seed"], keep="last").pivot(index="point", columns="seed", values="row")
+        row_index = rows.reindex(index=common_points, columns=common_seeds if paired else study_seeds).fillna(-1)
+        axis_values = runs.drop_duplicates("point", keep="last").set_index("point").loc[common_points, paths]
+        matched.append(_MatchedStudy(study, len(frame), row_index.to_numpy(int), axis_values))
     counts = len(common_points), len(points[0]) - len(common_points), len(points[1]) - len(common_points)
     return (matched[0], matched[1]), counts, len(common_seeds), paired
 
@@ -341,11 +334,11 @@ class _MatchedMetric:
 
     def __init__(self, metric: str, first: _MatchedStudy, second: _MatchedStudy, paired: bool):
         a, b = first.read_metric(metric), second.read_metric(metric)
-        self.only = (0, 0)
+        self.only: Any = (0, 0)
         if paired:
             finite = np.isfinite(a) & np.isfinite(b)
             stored = (first.row_index >= 0) & (second.row_index >= 0)
-            self.only = int((np.isfinite(a) & ~finite & stored).sum()), int((np.isfinite(b) & ~finite & stored).sum())
+            self.only = tuple(int((np.isfinite(values) & ~finite & stored).sum()) for values in (a, b))
             a, b = np.where(finite, a, np.nan), np.where(finite, b, np.nan)
         self.first, self.second = a, b
         self.means = _row_means(a), _row_means(b)
@@ -370,19 +363,14 @@ class _MatchedMetric:
 
 
 def _row_means(values: np.ndarray) -> np.ndarray:
-    """Mean of the finite numbers of each row; NaN if there are none."""
-    finite = np.isfinite(values)
-    with _ignore_undefined():
-        return np.where(finite, values, 0.0).sum(axis=1) / finite.sum(axis=1)
+    """Mean of the numbers of each row; NaN if there are none."""
+    return pd.DataFrame(values).mean(axis=1).to_numpy()
 
 
 def _row_statistics(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Count, mean and variance of the mean of the finite numbers of each row; the variance is NaN with fewer than two."""
-    finite = np.isfinite(values)
-    count, mean = finite.sum(axis=1), _row_means(values)
-    squares = (np.where(finite, values - mean[:, None], 0.0) ** 2).sum(axis=1)
-    with _ignore_undefined():
-        return count, mean, np.where(count > 1, squares / (count - 1) / count, np.nan)
+    """Count, mean and variance of the mean of the numbers of each row; the variance is NaN with fewer than two."""
+    rows = pd.DataFrame(values)
+    return rows.count(axis=1).to_numpy(), _row_means(values), rows.sem(axis=1).to_numpy() ** 2
 
 
 def _mean_differences(first: np.ndarray, second: np.ndarray, paired: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

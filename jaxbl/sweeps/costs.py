@@ -68,7 +68,7 @@ class Costs(NamedTuple):
 
     def of(self, backend: Backend) -> Cost:
         """The cost of a backend."""
-        return self.fused if backend == "fused" else self.scan
+        return getattr(self, backend)
 
     def compile_seconds(self, backend: Backend, operations: Operations) -> float:
         """Seconds to compile a program."""
@@ -138,20 +138,26 @@ def lanes_at_once(devices: Sequence[Any], backend: Backend, operations: Operatio
     return _GPU_LANES if devices[0].platform == "gpu" else load_costs(devices).best_lanes(backend, operations, len(devices))
 
 
-def choose_backend(
-    devices: Sequence[Any],
-    operations: Mapping[Backend, Operations],
-    layouts: Mapping[Backend, Layout],
-    samples: Mapping[Backend, int],
-    programs: int,
-) -> Backend:
+class Work(NamedTuple):
+    """The work of a study by a backend.
+
+    Attributes:
+        operations: operations of a sample.
+        layout: shape of a chunk.
+        samples: samples of all chunks.
+    """
+
+    operations: Operations
+    layout: Layout
+    samples: int
+
+
+def choose_backend(devices: Sequence[Any], works: Mapping[Backend, Work], programs: int) -> Backend:
     """The backend that takes less time in all.
 
     Args:
         devices: JAX devices to use.
-        operations: operations of a sample, by backend.
-        layouts: shape of a chunk, by backend.
-        samples: samples of all chunks, by backend.
+        works: what the study takes, by backend.
         programs: number of programs to compile.
     """
     if devices[0].platform not in ("cpu", "gpu") or (devices[0].platform == "gpu" and len(devices) > 1):
@@ -160,8 +166,9 @@ def choose_backend(
     costs = load_costs(devices)
 
     def total_seconds(backend: Backend) -> float:
-        run_seconds = samples[backend] * costs.sample_seconds(backend, operations[backend], layouts[backend])
-        return programs * costs.compile_seconds(backend, operations[backend]) + run_seconds
+        operations, layout, samples = works[backend]
+        run_seconds = samples * costs.sample_seconds(backend, operations, layout)
+        return programs * costs.compile_seconds(backend, operations) + run_seconds
 
     return min(BACKENDS, key=total_seconds)
 
@@ -245,7 +252,9 @@ def _trace_operations(experiment: Experiment, paths: Sequence[str], names: Metri
 def _equations(jaxpr: Any, repetitions: float) -> Iterator[tuple[float, Any]]:
     """Yield each equation with the number of times that it is evaluated; a loop with 0, before the equations in it."""
     for eqn in jaxpr.eqns:
-        inner_jaxprs = [inner for param in eqn.params.values() for inner in _jaxprs(param)]
+        inner_jaxprs = [
+            jaxpr for param in jax.tree.leaves(eqn.params) if hasattr(jaxpr := getattr(param, "jaxpr", param), "eqns")
+        ]
         if not inner_jaxprs:
             yield repetitions, eqn
             continue
@@ -254,14 +263,6 @@ def _equations(jaxpr: Any, repetitions: float) -> Iterator[tuple[float, Any]]:
             yield 0.0, eqn
         for inner in inner_jaxprs:
             yield from _equations(inner, repetitions * (eqn.params["length"] if is_loop else 1))
-
-
-def _jaxprs(param: Any) -> list[Any]:
-    """The jaxprs in a parameter of an equation."""
-    if isinstance(param, tuple | list):
-        return [jaxpr for part in param for jaxpr in _jaxprs(part)]
-    jaxpr = getattr(param, "jaxpr", param)
-    return [jaxpr] if hasattr(jaxpr, "eqns") else []
 
 
 _STUDY = {
@@ -291,9 +292,11 @@ def measure_costs(devices: list[Any]) -> Costs:
     operations = {path: count_operations(config, [path]) for path in _PATHS}
     few, cached, more = _FEW_LANES * count, _CACHED_LANES * count, _MORE_LANES * count
     # few scans: XLA compiles longer than they run
-    fused_cases: list[TimedCase] = [("fused", path, lanes) for path in _PATHS for lanes in (few, cached)]
-    scan_cases: list[TimedCase] = [("scan", _PATHS[0], lanes) for lanes in (few, cached, more)]
-    cases = [*fused_cases, *scan_cases, ("scan", _PATHS[1], cached)]
+    cases: list[TimedCase] = [
+        *(("fused", path, lanes) for path in _PATHS for lanes in (few, cached)),
+        *(("scan", _PATHS[0], lanes) for lanes in (few, cached, more)),
+        ("scan", _PATHS[1], cached),
+    ]
     sample_seconds, compile_seconds = _time_programs(config, devices, cases)
 
     def fit_cost(backend: Backend) -> Cost:

@@ -10,7 +10,6 @@ import itertools
 import math
 import statistics
 import time
-from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -22,14 +21,16 @@ from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
-from .costs import Operations, choose_backend, count_operations, lanes_at_once, load_costs
-from .metrics import MetricNames, ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
+from .costs import Operations, Work, choose_backend, count_operations, lanes_at_once, load_costs
+from .metrics import ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
 from .points import Points
 from .programs import (
     BACKENDS,
+    MAX_PROGRAMS,
     Backend,
     Layout,
     Program,
+    RecentResults,
     check_backend,
     compile_program,
     computed_metrics,
@@ -83,14 +84,15 @@ def layout_for(config: Config, points: Points, count: int, capacity: int) -> Lay
         # a batch has few points and needs all their seeds; each device still gets 64 points of a chunk
         seeds = min(config.sweep.seeds, max(capacity // (64 * count), 1))
         return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
+    size = points.group_size
     # chunks of equal size need little padding; devices share the points or else the seeds, in a multiple of their number
-    per_chunk = math.ceil(points.group_size / math.ceil(points.group_size / capacity))
-    if points.group_size >= count and points.group_size > 1:
+    per_chunk = math.ceil(size / math.ceil(size / capacity))
+    if size >= count and size > 1:
         per_chunk = max(math.ceil(per_chunk / count), 2) * count
     seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
-    if points.group_size == 1:
+    if size == 1:
         seeds = max(math.ceil(seeds / count), 2) * count
-    elif points.group_size < count:
+    elif size < count:
         seeds = math.ceil(seeds / count) * count
     return Layout(seeds, per_chunk)
 
@@ -99,8 +101,6 @@ _CHUNK_BYTES = 100
 """Bytes of a chunk in the list of all."""
 _LANE_BYTES = 200
 """Least bytes of a lane: its numbers, state and metrics."""
-_MAX_PROGRAMS = 16
-"""Number of compiled programs in memory; each group has one."""
 _TIMED_SAMPLES, _TIMED_SECONDS = 100, 0.5
 """Least length of the short runs that an estimate is made from; of large chunks 2000 samples take minutes."""
 _COUNTED_GROUPS = 24
@@ -120,11 +120,6 @@ def _rank_coarse_first(count: int) -> tuple[np.ndarray, np.ndarray]:
         swapped = rng.integers(0, 2, 1 << level)[index >> bits - level]
         rank |= (index >> bits - 1 - level & 1 ^ swapped) << level
     return rank, np.frexp(rank)[1]
-
-
-def _slice_evenly(indices: np.ndarray, length: int) -> list[np.ndarray]:
-    """Cut indices into slices of a length; the last one may be shorter."""
-    return [indices[first : first + length] for first in range(0, len(indices), length)]
 
 
 class Engine:
@@ -157,8 +152,7 @@ class Engine:
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
-        self._programs: OrderedDict[int, Program] = OrderedDict()
-        self._gain_metric_dtypes: set[str] = set()
+        self._programs = RecentResults()
         self._needs_gain_metrics = needs_gain_metrics(config.sweep.requested_metrics)
 
     def _choose_backend(self) -> Backend:
@@ -166,12 +160,11 @@ class Engine:
         if not self._varied_paths:
             # the fused loop does not support lanes that differ only in their seed
             return "scan"
-        layouts: dict[Backend, Layout] = {backend: self._choose_layout(backend, None) for backend in BACKENDS}
-        steps = sum(group.config.run.steps for group in self.points.groups)
-        samples: dict[Backend, int] = {
-            backend: steps * self.count_chunks(self.points.coarse_size, layout) for backend, layout in layouts.items()
-        }
-        return choose_backend(self.devices, self._operations, layouts, samples, len(self.points.groups))
+        works, steps = {}, sum(group.config.run.steps for group in self.points.groups)
+        for backend, operations in self._operations.items():
+            layout = self._choose_layout(backend, None)
+            works[backend] = Work(operations, layout, steps * self.count_chunks(self.points.coarse_size, layout))
+        return choose_backend(self.devices, works, len(self.points.groups))
 
     def _choose_layout(self, backend: Backend, chunk: int | None) -> Layout:
         """Choose the chunk shape for the number of lanes that is set, or else for the number that suits the devices."""
@@ -183,11 +176,16 @@ class Engine:
     @functools.cached_property
     def _operations(self) -> dict[Backend, Operations]:
         """Operations of a sample by backend, in the group with most samples."""
-        config = max(self.points.groups, key=lambda group: group.config.run.steps).config
-        requested = config.sweep.requested_metrics
-        names: dict[Backend, MetricNames] = {backend: computed_metrics(backend, requested) for backend in BACKENDS}
-        operations = {computed: count_operations(config, self._varied_paths, computed) for computed in set(names.values())}
-        return {backend: operations[computed] for backend, computed in names.items()}
+        return {backend: self._count_operations(backend, self._longest_config) for backend in BACKENDS}
+
+    @property
+    def _longest_config(self) -> Config:
+        """The study of the group with most samples."""
+        return max((group.config for group in self.points.groups), key=lambda config: config.run.steps)
+
+    def _count_operations(self, backend: Backend, config: Config) -> Operations:
+        """Count the operations of a sample in a group."""
+        return count_operations(config, self._varied_paths, computed_metrics(backend, config.sweep.requested_metrics))
 
     @property
     def _varied_paths(self) -> list[str]:
@@ -223,7 +221,7 @@ class Engine:
         check_cost("the list of chunks", _CHUNK_BYTES * math.prod(shape), "[sweep] chunk should be larger, or left out")
         group, seed_slice, point_slice = np.unravel_index(np.arange(math.prod(shape)), shape)
         rank, level = _rank_coarse_first(slice_count)
-        if len(self.points.groups) <= _MAX_PROGRAMS:
+        if len(self.points.groups) <= MAX_PROGRAMS:
             keys = seed_slice, level[point_slice], group, rank[point_slice]
         else:
             keys = group, seed_slice, rank[point_slice]
@@ -241,7 +239,8 @@ class Engine:
             first_index: index of the first chunk; the others count up from it.
         """
         seed_slices = map(self._seed_slice, range(self._seed_slices))
-        pairs = itertools.product(seed_slices, _slice_evenly(points, self.layout.points))
+        ends = range(self.layout.points, len(points), self.layout.points)
+        pairs = itertools.product(seed_slices, np.split(points, ends))
         return [Chunk(index, group, seeds, point_slice) for index, (seeds, point_slice) in enumerate(pairs, first_index)]
 
     @property
@@ -291,7 +290,7 @@ class Engine:
         """Arguments of a compiled program, padded to the layout: values by path, and seeds."""
 
         def pad(values: np.ndarray, size: int) -> np.ndarray:
-            return np.concatenate([values, np.repeat(values[-1:], size - len(values), axis=0)])
+            return np.pad(values, (0, size - len(values)), "edge")
 
         dtype = config.run.precision
         padded = {path: pad(np.asarray(column, dtype), self.layout.points) for path, column in columns.items()}
@@ -304,12 +303,7 @@ class Engine:
 
     def _program(self, group: int) -> Program:
         """The compiled program of a group; the last ones used stay in memory."""
-        if group not in self._programs:
-            self._programs[group] = self._compile(self.points.groups[group].config)
-        self._programs.move_to_end(group)
-        while len(self._programs) > _MAX_PROGRAMS:
-            self._programs.popitem(last=False)
-        return self._programs[group]
+        return self._programs.take(group, lambda: self._compile(self.points.groups[group].config))
 
     def _compile(self, config: Config) -> Program:
         with precision(config):
@@ -336,18 +330,15 @@ class Engine:
         return add_gain_metrics(metrics, gains) if self._needs_gain_metrics else metrics
 
     def _compile_gain_metrics(self, dtype: str) -> None:
-        """Compile the gain metrics for a precision, unless that is done or none are requested."""
-        if dtype not in self._gain_metric_dtypes and self._needs_gain_metrics:
-            self._gain_metric_dtypes.add(dtype)
+        """Compile the gain metrics for a precision, unless none are requested."""
+        if self._needs_gain_metrics:
             start = time.perf_counter()
             compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)
             self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
         """Estimate memory and time of all chunks, by a compilation and short runs of the group with most samples."""
-        groups = self.points.groups
-        group = max(range(len(groups)), key=lambda index: groups[index].config.run.steps)
-        config, chunk = groups[group].config, self.chunk(group * (len(self) // len(groups)))
+        groups, config, chunk = self.points.groups, self._longest_config, self.chunk(0)
         with without_cache_writes():
             program = self._compile(config)
             program_seconds = self.compile_seconds
@@ -391,7 +382,7 @@ class Engine:
 
     def _predict_seconds(self, backend: Backend, config: Config) -> float:
         """Seconds that a chunk of a group should take."""
-        operations = count_operations(config, self._varied_paths, computed_metrics(backend, config.sweep.requested_metrics))
+        operations = self._count_operations(backend, config)
         return load_costs(self.devices).sample_seconds(backend, operations, self.layout) * config.run.steps
 
 

@@ -9,6 +9,7 @@ run, in SI units. Position and velocity tolerances of the load are those of the 
 import abc
 import functools
 from collections.abc import Callable, Iterable, Mapping
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -401,7 +402,7 @@ class LimitCycleAmplitude(RunMetric):
     closed_loop = True
 
     def init(self, zero):
-        return LimitCycle(zero + jnp.inf, zero - jnp.inf, zero + jnp.inf, zero - jnp.inf, *[zero] * 5)
+        return LimitCycle(*[zero + jnp.inf, zero - jnp.inf] * 2, *[zero] * 5)
 
     def update(self, carry, sample):
         error, before, inside = sample.following_error, sample.before > 0.0, sample.inside > 0.0
@@ -445,11 +446,11 @@ def _convergence_time(formula: Callable[..., Array]) -> Callable[[GainMetric, Ob
 
 
 def _make_margin(name: str, condition: conditions.Condition) -> type[GainMetric]:
-    def judge(self: Any, gains: ObserverGains, f_plus: Array) -> Array:
-        return gains.lambda_ / condition.least_lambda(gains.alpha, f_plus)
-
     label, doc = f"margin to {condition.title}", f"λ over the least λ of {condition.title}"
-    return GainMetric.of(f"margin_{name}", "", label, doc, judge=judge)
+    return GainMetric.of(
+        f"margin_{name}", "", label, doc,
+        judge=lambda _, gains, f_plus: gains.lambda_ / condition.least_lambda(gains.alpha, f_plus),
+    )  # fmt: skip
 
 
 for _metric in (
@@ -466,32 +467,32 @@ for _metric in (
         judge=_convergence_time(conditions.convergence_time_worst),
     ),
     Rms.of("position_rmse", "rad", "position error, rms", "rms position error", better="less",
-           signal=lambda _, sample: sample.position_error),
+           signal=attrgetter("position_error")),
     Rms.of("velocity_rmse", "rad/s", "velocity error, rms", "rms velocity error", better="less",
-           signal=lambda _, sample: sample.velocity_error),
+           signal=attrgetter("velocity_error")),
     Rms.of(
         "torque_rmse", "N m", "torque error, rms",
         "rms error of the transmitted torque from this side's equivalent control",
         better="less",
-        signal=lambda _, sample: sample.torque_error,
+        signal=attrgetter("torque_error"),
     ),
     Rms.of(
         "position_size", "rad", "position, rms", "rms true position: the size that its errors compare with",
-        signal=lambda _, sample: sample.true.position,
+        signal=attrgetter("true.position"),
     ),
     Rms.of(
         "velocity_size", "rad/s", "velocity, rms", "rms true velocity: the size that its errors compare with",
-        signal=lambda _, sample: sample.true.velocity,
+        signal=attrgetter("true.velocity"),
     ),
     Chatter,
     Peak.of(
         "f_plus", "rad/s²", "true bound f⁺", "largest true right-hand side error |f(x₂) − f(x̂₂) + ξ| along the run",
-        signal=lambda _, sample: sample.true.perturbation,
+        signal=attrgetter("true.perturbation"),
     ),
     Peak.of(
         "f_plus_acceleration", "rad/s²", "twice the largest acceleration",
         "twice the largest acceleration: the paper's text for f⁺",
-        signal=lambda _, sample: sample.true.acceleration,
+        signal=attrgetter("true.acceleration"),
         factor=2.0,
     ),
     GainMetric.of(
@@ -506,9 +507,9 @@ for _metric in (
     ),
     Excitation,
     Rms.of("following_rmse", "rad", "following error, rms", "rms difference of reference and true position",
-           better="less", closed_loop=True, signal=lambda _, sample: sample.following_error),
+           better="less", closed_loop=True, signal=attrgetter("following_error")),
     Peak.of("following_peak", "rad", "following error, peak", "largest difference of reference and true position",
-            better="less", closed_loop=True, signal=lambda _, sample: sample.following_error),
+            better="less", closed_loop=True, signal=attrgetter("following_error")),
     SettlingTime,
     LimitCycleAmplitude,
     LimitCycleFrequency,
@@ -517,7 +518,7 @@ for _metric in (
     ImpactSpeed,
     Rms.of("torque_rms", "N m", "driving torque, rms",
            "rms torque that drives the side (motor: the input; load: through the gear)",
-           better="less", closed_loop=True, signal=lambda _, sample: sample.driving_torque),
+           better="less", closed_loop=True, signal=attrgetter("driving_torque")),
 ):  # fmt: skip
     SIDE_METRICS.add(_metric)
 
@@ -525,6 +526,8 @@ for _metric in (
 MetricNames = tuple[str, ...] | None
 """Names of the metrics that a study requests; None requests all."""
 
+Carries = dict[str, dict[str, Any]]
+"""States of metrics by side and name."""
 _OVERFLOW_METRICS = ("position_rmse", "velocity_rmse", "torque_rmse", "f_plus", "f_plus_acceleration")
 """Metrics that overflow if the lane does: they show whether it stayed finite."""
 
@@ -565,20 +568,19 @@ def _window_start_time(experiment: Experiment) -> Number:
     return window_start(experiment.run.steps) * experiment.run.sample_period
 
 
-def _init_carries(names: MetricNames, experiment: Experiment) -> dict[str, tuple]:
+def _init_carries(names: MetricNames, experiment: Experiment) -> Carries:
     zero = jnp.zeros_like(experiment.run.sample_period)
-    metrics = _carried_metrics(experiment, names).values()
-    return {side: tuple(metric.init(zero) for metric in metrics) for side in experiment.sides}
+    metrics = _carried_metrics(experiment, names)
+    return {side: {name: metric.init(zero) for name, metric in metrics.items()} for side in experiment.sides}
 
 
-def _are_metrics_final(names: MetricNames, experiment: Experiment, carry: tuple) -> Array | None:
+def _are_metrics_final(names: MetricNames, experiment: Experiment, carry: Mapping[str, Any]) -> Array | None:
     """True if no further sample can change any requested metric of a side; None if this cannot be told."""
     if names is None or needs_gain_metrics(names):
         return None
-    states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     start = _window_start_time(experiment)
     metrics = _loop_metrics(experiment, names)
-    flags: Any = [metric.is_final(states[metric.carry or name], experiment, start) for name, metric in metrics.items()]
+    flags: Any = [metric.is_final(carry[metric.carry or name], experiment, start) for name, metric in metrics.items()]
     return None if not flags or any(flag is None for flag in flags) else functools.reduce(jnp.logical_and, flags)
 
 
@@ -591,8 +593,8 @@ def identified_parameters(experiment: Experiment, state: State) -> Mapping[str, 
 
 
 def _update_carries(
-    names: MetricNames, experiment: Experiment, carries: dict[str, tuple], index: Int[Array, ""], signals: Signals
-) -> dict[str, tuple]:
+    names: MetricNames, experiment: Experiment, carries: Carries, index: Int[Array, ""], signals: Signals
+) -> Carries:
     """Carries after a sample, by side."""
     run = experiment.run
     inside = (index >= window_start(run.steps)).astype(signals.time.dtype)
@@ -611,8 +613,8 @@ def _update_carries(
         sample = SideSample(signals.time, inside, within, true, position, velocity, torque)
         if signals.target is not None:
             sample = _add_following(experiment, sample, side, index, signals)
-        metrics = _carried_metrics(experiment, names).values()
-        new_carry = tuple(metric.update(state, sample) for metric, state in zip(metrics, carry, strict=True))
+        metrics = _carried_metrics(experiment, names)
+        new_carry = {name: metric.update(carry[name], sample) for name, metric in metrics.items()}
         is_final = _are_metrics_final(names, experiment, carry)
         if is_final is not None:
             # the result must not depend on whether the lane stops here: a later overflow does not count
@@ -654,41 +656,40 @@ def _add_following(
 
 
 def _compute_results(
-    names: MetricNames, experiment: Experiment, carry: tuple, state: State, side: str, result_names: Iterable[str]
+    experiment: Experiment, carry: Mapping[str, Any], state: State, side: str, names: Iterable[str]
 ) -> TracedArrays:
     """Metrics of a side by name, from its states so far."""
     run = experiment.run
     parameters = identified_parameters(experiment, state).get(side, {})
     end = SideEnd(experiment, state, _window_start_time(experiment), run.steps - window_start(run.steps), parameters)
-    states = dict(zip(_carried_metrics(experiment, names), carry, strict=True))
     metrics = _select_metrics(RunMetric)
-    return {name: metrics[name].result(states[metrics[name].carry or name], end) for name in result_names}
+    return {name: metrics[name].result(carry[metrics[name].carry or name], end) for name in names}
 
 
 def _is_finite(results: TracedArrays) -> Array:
     return jnp.isfinite(sum(results[name] for name in _OVERFLOW_METRICS))
 
 
-def _is_done(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> Array:
+def _is_done(names: MetricNames, experiment: Experiment, carries: Carries, state: State) -> Array:
     """True if the requested metrics of each side are final, or the side has overflowed.
 
     A metric that has overflowed does not become finite again, and all metrics of its side are then NaN.
     """
     undecided = []
     for side, carry in carries.items():
-        finite = _is_finite(_compute_results(names, experiment, carry, state, side, _OVERFLOW_METRICS))
+        finite = _is_finite(_compute_results(experiment, carry, state, side, _OVERFLOW_METRICS))
         is_final = _are_metrics_final(names, experiment, carry)
         undecided.append(finite if is_final is None else finite & ~is_final)
     return ~functools.reduce(jnp.logical_or, undecided)
 
 
-def _finish_metrics(names: MetricNames, experiment: Experiment, carries: dict[str, tuple], state: State) -> dict[str, Array]:
+def _finish_metrics(names: MetricNames, experiment: Experiment, carries: Carries, state: State) -> dict[str, Array]:
     """`finite` and the metrics of both sides by column, from the last carries."""
     columns: dict[str, Array] = {}
     all_finite = jnp.asarray(True)
     metrics = _loop_metrics(experiment, names)
     for side, carry in carries.items():
-        results = _compute_results(names, experiment, carry, state, side, dict.fromkeys([*metrics, *_OVERFLOW_METRICS]))
+        results = _compute_results(experiment, carry, state, side, dict.fromkeys([*metrics, *_OVERFLOW_METRICS]))
         finite = _is_finite(results)
         for name in metrics:
             columns[f"{side}.{name}"] = jnp.where(finite, results[name], False if name == "converged" else jnp.nan)
@@ -724,7 +725,10 @@ def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
     observers = {side: getattr(experiment.observer, side) for side in experiment.sides}
     if not all(isinstance(observer, AbstractSuperTwisting) for observer in observers.values()):
         return {}
-    return {s: ObserverGains(*(getattr(observers[s], field) for field in ObserverGains._fields)) for s in observers}
+    return {
+        side: ObserverGains(*(getattr(observer, field) for field in ObserverGains._fields))
+        for side, observer in observers.items()
+    }
 
 
 def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> NamedArrays:
@@ -737,17 +741,14 @@ def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]
         gains: gains by side, of shapes that broadcast to that.
     """
     columns = {name: np.asarray(metric) for name, metric in metrics.items()}
-    if not gains:
-        return columns
-    f_plus = np.stack([columns[f"{side}.f_plus"] for side in gains])
-    arguments = [[np.asarray(gain, f_plus.dtype) for gain in sides] for sides in zip(*gains.values(), strict=True)]
-    for side, *side_arguments in zip(gains, *arguments, f_plus, strict=True):
-        rows = np.stack([np.broadcast_to(argument, f_plus.shape[1:]).ravel() for argument in side_arguments], axis=1)
+    for side, side_gains in gains.items():
+        f_plus = columns[f"{side}.f_plus"]
+        arguments = (np.broadcast_to(argument, f_plus.shape).ravel() for argument in (*side_gains, f_plus))
         # lanes share the numbers that no axis varies
-        unique, row_index = _unique_rows(rows)
+        unique, row_index = _unique_rows(np.stack([*arguments], axis=1, dtype=f_plus.dtype))
         # the program that the study's chunks have compiled, however few of the rows differ
-        results = apply_elementwise(compute_gain_metrics, list(unique.T), largest=f_plus[0].size)
-        columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape[1:]) for name, result in results.items()}
+        results = apply_elementwise(compute_gain_metrics, list(unique.T), largest=f_plus.size)
+        columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape) for name, result in results.items()}
     return columns
 
 
@@ -758,8 +759,9 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[first], index
 
 
+@functools.cache
 def compile_gain_metrics(dtype: str, lanes: int) -> None:
-    """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision; all studies share it."""
+    """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision, once; all studies share it."""
     apply_elementwise(compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 

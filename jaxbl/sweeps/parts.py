@@ -4,7 +4,6 @@ A part is only read if it is what was written, however old it is and wherever it
 """
 
 import json
-import zlib
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -14,15 +13,16 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaxbl.files import catch_store_errors, is_remote, write_atomic
+from jaxbl.errors import InputError
+from jaxbl.files import DamagedFile, catch_store_errors, checksum, is_remote, write_atomic
 from jaxbl.json_types import JsonObject
 
 _KEY, _SUM, _NO_SUM = b"jaxbl.part", b"jaxbl.checksum", b"00000000"
 """Keys of the file's metadata: the header as JSON, and the checksum of the file in which eight zeros stand in its place."""
 
 
-class Damaged(Exception):
-    """A part that is not what was written. The message says how."""
+RECOMPUTE = "run 'jaxbl sweep' again, which moves it to damaged/ and computes it anew"
+"""What mends a damaged part."""
 
 
 class PartHeader(NamedTuple):
@@ -53,17 +53,17 @@ def write_part(path: Path, frame: pd.DataFrame, header: PartHeader) -> None:
     # dictionaries of values that hardly repeat would take most of the time
     pq.write_table(table, file, write_page_checksum=True, use_dictionary=False)
     content = bytearray(file.getbuffer())
-    place, checksum = _checksum(content)
-    content[place : place + len(_NO_SUM)] = checksum
+    place, expected = _find_checksum(content)
+    content[place] = expected
     write_atomic(path, content)
 
 
-def _checksum(content: bytes | bytearray) -> tuple[int, bytes]:
-    """Return the place of a file's checksum and what it should be: CRC-32, which detects damage, not forgery."""
+def _find_checksum(content: bytes | bytearray) -> tuple[slice, bytes]:
+    """Return the place of a file's checksum, and what it should be."""
     # after the key come the type and the length of the value
-    place = content.rfind(_SUM) + len(_SUM) + 2
-    start = zlib.crc32(_NO_SUM, zlib.crc32(memoryview(content)[:place]))
-    return place, b"%08x" % zlib.crc32(memoryview(content)[place + len(_NO_SUM) :], start)
+    start = content.rfind(_SUM) + len(_SUM) + 2
+    place, view = slice(start, start + len(_NO_SUM)), memoryview(content)
+    return place, checksum(view[: place.start], _NO_SUM, view[place.stop :]).encode()
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool = True) -> tuple[PartHeader, pd.DataFrame]:
@@ -75,32 +75,33 @@ def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool =
         check: read the whole file first, and compare it with its checksum; otherwise only pages are compared with theirs.
 
     Raises:
-        Damaged: the file is not what was written.
+        DamagedFile: the file is not what was written.
         FileNotFoundError: there is none.
+        InputError: an object store does not answer.
     """
     try:
         # opened here, as the library takes names in UTF-8 alone
-        source = BytesIO(_read_checked(path)) if check or is_remote(path) else path.open("rb")
+        source = BytesIO(read_checked(path)) if check or is_remote(path) else path.open("rb")
         with source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             header = json.loads((file.schema_arrow.metadata or {})[_KEY])
             frame = pd.DataFrame() if columns == () else file.read(columns=columns).to_pandas()
             return PartHeader(**header), frame
-    except FileNotFoundError:
+    except (FileNotFoundError, InputError):
         raise
     except (OSError, ValueError, KeyError, TypeError, MemoryError, pa.ArrowException) as error:
         reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
-        raise Damaged(f"cannot be read ({reason})") from None
+        raise DamagedFile(path, f"cannot be read ({reason})", RECOMPUTE) from None
 
 
-def _read_checked(path: Path) -> bytes:
-    """Read a file whose checksum is right."""
+def read_checked(path: Path) -> bytes:
+    """Read a file whose checksum is right. Raises as :func:`read_part`."""
     if is_remote(path) and not path.exists():
         raise FileNotFoundError(path)
     with catch_store_errors(path, "read"):
         content = path.read_bytes()
-    place, checksum = _checksum(content)
     if _SUM not in content:
-        raise Damaged("has no header that names its study and chunk")
-    if content[place : place + len(checksum)] != checksum:
-        raise Damaged("does not agree with its checksum")
+        raise DamagedFile(path, "has no header that names its study and chunk", RECOMPUTE)
+    place, expected = _find_checksum(content)
+    if content[place] != expected:
+        raise DamagedFile(path, "does not agree with its checksum", RECOMPUTE)
     return content

@@ -72,18 +72,16 @@ class Points:
         refined = self._refined_paths(config)
         depth = config.sweep.refine or 0
         self.dimensions = dimensions = self._build_dimensions(config, dict.fromkeys(refined, depth))
-        structural = [columns for columns in dimensions if not all(path in self.leaves for path in columns)]
-        self._leaf_dimensions = [columns for columns in dimensions if all(path in self.leaves for path in columns)]
+        structural = [columns for columns in dimensions if not self.leaves.issuperset(columns)]
+        self._leaf_dimensions = [columns for columns in dimensions if self.leaves.issuperset(columns)]
         self.group_size = _count_points(self._leaf_dimensions)
         self.refinement: Refinement | None = None
         self.coarse_size = self.group_size
         if refined:
             is_refined = [next(iter(columns)) in refined for columns in self._leaf_dimensions]
-            fine_sizes = [_length(columns) for columns in self._leaf_dimensions]
-            sizes = [(n - 1 >> depth) + 1 if halved else n for n, halved in zip(fine_sizes, is_refined, strict=True)]
-            self.coarse_size = math.prod(sizes)
-            criterion = _build_criterion(config, base, metrics, refined)
-            self.refinement = Refinement(refined, CellGrid(sizes, is_refined, depth), criterion)
+            grid = CellGrid([*map(_length, self._leaf_dimensions)], is_refined, depth)
+            self.coarse_size = math.prod(grid.coarse_sizes)
+            self.refinement = Refinement(refined, grid, _build_criterion(config, base, metrics, refined))
         runs_per_point = _count_points(structural) * config.sweep.seeds
         if (runs := runs_per_point * self.coarse_size) > _MAX_RUNS:
             raise InputError(f"axes: {runs:.2g} runs are more than {_MAX_RUNS:.0e}; fewer values, or a quasi-random design")
@@ -144,8 +142,8 @@ class Points:
     @staticmethod
     def _build_kinds(config: Config, base: Config) -> list[Experiment]:
         """An experiment with each kind of observer, where that is an axis; all must have the gains that other axes vary."""
-        kinds = [axis.values or [] for axis in config.axes if axis.path == KIND]
-        variants = [with_values(base, {KIND: kind}) for kind in (kinds[0] if kinds else ())]
+        kinds = (kind for axis in config.axes if axis.path == KIND for kind in axis.values or ())
+        variants = [with_values(base, {KIND: kind}) for kind in kinds]
         for variant in variants:
             valid = numeric_paths(variant)
             for i, axis in enumerate(config.axes):
@@ -199,31 +197,28 @@ class Points:
                 raise InputError(
                     f"axes: '{axis.path}' is sampled quasi-randomly and cannot be zipped; leave zip out, or list its values"
                 )
-        dimensions: list[AxisColumns] = []
-        zipped: dict[str, AxisColumns] = {}
+        # by label; the axes that are sampled together have none
+        dimensions: dict[str | None, AxisColumns] = {}
         for axis in config.axes:
             if axis in sampled:
                 if axis is sampled[0]:
-                    dimensions.append(_sample_points(sampled, config))
-            elif axis.zip is None:
-                dimensions.append({axis.path: axis.grid(depths.get(axis.path, 0))})
-            elif axis.zip not in zipped:
-                zipped[axis.zip] = {axis.path: axis.grid()}
-                dimensions.append(zipped[axis.zip])
-            else:
-                columns, values = zipped[axis.zip], axis.grid()
-                if len(values) != (length := _length(columns)):
-                    raise InputError(
-                        f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{axis.zip}' have {length}; "
-                        "they should have equally many"
-                    )
-                columns[axis.path] = values
-        for label, columns in zipped.items():
+                    dimensions[None] = _sample_points(sampled, config)
+                continue
+            label = axis.path if axis.zip is None else axis.zip
+            columns = dimensions.setdefault(label, {})
+            columns[axis.path] = values = axis.grid(depths.get(axis.path, 0))
+            if len(values) != (length := _length(columns)):
+                raise InputError(
+                    f"axes: '{axis.path}' has {len(values)} values, the others zipped as '{label}' have {length}; "
+                    "they should have equally many"
+                )
+        for label in dict.fromkeys(axis.zip for axis in config.axes if axis.zip is not None):
+            columns = dimensions[label]
             if len(columns) < 2 or label in (*self.paths, "seed"):
                 raise InputError(f"axes: zip = '{label}' should stand on two axes or more, and be neither a path nor 'seed'")
             if len(set(zip(*(column.tolist() for column in columns.values()), strict=True))) < _length(columns):
                 raise InputError(f"axes: the axes zipped as '{label}' list a point twice; their points should differ")
-        return dimensions
+        return list(dimensions.values())
 
 
 def _extremes(values: list[Any]) -> list[Any]:

@@ -44,9 +44,24 @@ def computed_metrics(backend: Backend, names: MetricNames) -> MetricNames:
 
 Result = TypeVar("Result")
 
-_MAX_SHARED = 16
-"""Number of programs that are held for other studies."""
-_shared_results: ContextVar[OrderedDict[Any, Any] | None] = ContextVar("shared", default=None)
+MAX_PROGRAMS = 16
+"""Number of compiled programs in memory, for each study and for studies that share them."""
+
+
+class RecentResults(OrderedDict[Any, Any]):
+    """The last results by key."""
+
+    def take(self, key: Any, build: Callable[[], Result]) -> Result:
+        """Return the result of a key; if it is not there, it is built, and the oldest one may be forgotten."""
+        if key not in self:
+            self[key] = build()
+        self.move_to_end(key)
+        if len(self) > MAX_PROGRAMS:
+            self.popitem(last=False)
+        return self[key]
+
+
+_shared_results: ContextVar[RecentResults | None] = ContextVar("shared", default=None)
 
 
 @contextmanager
@@ -56,7 +71,7 @@ def share_programs() -> Iterator[None]:
     The stages of a search for gains are such studies. Inside another such context they share its programs.
     """
     shared = _shared_results.get()
-    before = _shared_results.set(OrderedDict() if shared is None else shared)
+    before = _shared_results.set(RecentResults() if shared is None else shared)
     try:
         yield
     finally:
@@ -78,12 +93,7 @@ def share_result(experiment: Experiment, paths: Iterable[str], arguments: Any, b
     leaves, structure = jax.tree.flatten(set_leaves(experiment, dict.fromkeys(paths, np.zeros(()))))
     arrays = [np.asarray(leaf) for leaf in leaves]
     key = arguments, tuple(paths), structure, tuple((array.dtype, array.shape, array.tobytes()) for array in arrays)
-    if key not in results:
-        results[key] = build()
-    results.move_to_end(key)
-    while len(results) > _MAX_SHARED:
-        results.popitem(last=False)
-    return results[key]
+    return results.take(key, build)
 
 
 class Layout(NamedTuple):
@@ -168,15 +178,14 @@ def _compile_fused(
         raise Unsupported("lanes that differ only in their seed")
     from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
-    if devices[0].platform == "cpu":
-        simulator: LaneSimulator = HostSimulator(experiment, (metrics_reducer(names),), paths, layout.points, len(devices))
-    elif devices[0].platform == "gpu" and len(devices) == 1:
-        with jax.default_device(devices[0]):
-            simulator = DeviceSimulator(experiment, (metrics_reducer(names),), paths, layout.points)
-    else:
-        raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
-
+    arguments = experiment, (metrics_reducer(names),), paths, layout.points
     with jax.default_device(devices[0]):
+        if devices[0].platform == "cpu":
+            simulator: LaneSimulator = HostSimulator(*arguments, len(devices))
+        elif devices[0].platform == "gpu" and len(devices) == 1:
+            simulator = DeviceSimulator(*arguments)
+        else:
+            raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
         # compile the program that draws the noise, now and not with the first chunk
         next(simulator.compute_inputs(0))
 
@@ -203,16 +212,12 @@ def _compile_scan(experiment: Experiment, layout: Layout, devices: list[Any], co
     # devices share the points, or else the seeds, if their number divides evenly; otherwise one device computes all
     seeds, points = layout
     count = len(devices)
-    by_points, by_seeds = points % count == 0, points % count != 0 and seeds % count == 0
-    mesh = Mesh(np.array(devices if by_points or by_seeds else devices[:1]), ("lanes",))
-    over_points = PartitionSpec("lanes" if by_points else None)
-    over_seeds = PartitionSpec("lanes" if by_seeds else None)
-    local_points = points // count if by_points else points
+    shape = (1, count) if points % count == 0 else (count, 1) if seeds % count == 0 else (1, 1)
     run_chunk = jax.shard_map(
-        jax.vmap(jax.vmap(run_lane, in_axes=(0, None), axis_size=local_points), in_axes=(None, 0)),
-        mesh=mesh,
-        in_specs=(over_points, over_seeds),
-        out_specs=PartitionSpec(*over_seeds, *over_points),
+        jax.vmap(jax.vmap(run_lane, in_axes=(0, None), axis_size=points // shape[1]), in_axes=(None, 0)),
+        mesh=Mesh(np.array(devices[: math.prod(shape)]).reshape(shape), ("seeds", "points")),
+        in_specs=(PartitionSpec("points"), PartitionSpec("seeds")),
+        out_specs=PartitionSpec("seeds", "points"),
         check_vma=False,
     )
     example = {path: np.zeros(points, column.dtype) for path, column in columns.items()}, np.zeros(seeds, np.uint32)

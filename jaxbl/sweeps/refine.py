@@ -11,8 +11,7 @@ At the finest level the second rule traces each piece of the boundary from end t
 has the size of the fine grid: vertices and cells are sorted arrays of flat indices.
 """
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -54,20 +53,20 @@ class CellGrid:
     that of its lower corner.
 
     Args:
-        sizes: vertices of the coarse grid along each axis, last axis fastest.
+        sizes: vertices along each axis, last axis fastest.
         is_refined: for each axis, True if its cells are halved.
         depth: number of times that they are halved.
     """
 
     def __init__(self, sizes: Sequence[int], is_refined: Sequence[bool], depth: int):
         self.depth = depth
-        self.coarse_sizes = tuple(sizes)
-        self.sizes = tuple((n - 1 << depth) + 1 if halved else n for n, halved in zip(sizes, is_refined, strict=True))
-        refined, fine_sizes = np.array(is_refined, bool), np.array(self.sizes, np.int64)
+        self.sizes = tuple(sizes)
+        self.coarse_sizes = tuple((n - 1 >> depth) + 1 if halved else n for n, halved in zip(sizes, is_refined, strict=True))
+        refined, fine_sizes = np.array(is_refined, bool), np.array(sizes, np.int64)
         steps = np.cumprod([1, *fine_sizes[:0:-1]], dtype=np.int64)[::-1][: len(sizes)]
         # flat distance of neighbours on the coarse grid, and number of cells on it, along each axis
         self._strides = np.where(refined, steps << depth, steps)
-        self._coarse_cell_counts = (np.array(sizes, np.int64) - refined).tolist()
+        self._coarse_cell_counts = (np.array(self.coarse_sizes, np.int64) - refined).tolist()
         # of the refined axes alone: flat distance of neighbours on the fine grid, and number of vertices
         self._steps, self._sizes = steps[refined].tolist(), fine_sizes[refined].tolist()
 
@@ -85,10 +84,7 @@ class CellGrid:
 
     def _lattice(self, counts: Sequence[int]) -> Indices:
         """The first vertices of the coarse grid along each axis, so many as `counts` says."""
-        out = np.zeros(1, np.int64)
-        for count, stride in zip(counts, self._strides, strict=True):
-            out = (out[:, None] + stride * np.arange(count)).ravel()
-        return out
+        return _all_sums(stride * np.arange(count) for count, stride in zip(counts, self._strides, strict=True))
 
     def children(self, cells: Indices, level: int) -> Indices:
         """The cells of `level` into which cells of the level before are halved."""
@@ -98,14 +94,10 @@ class CellGrid:
         """The corners of the :meth:`children` of cells."""
         return self._shift_cells(cells, level, (0, 1, 2))
 
-    def _shift_cells(self, cells: Indices, level: int, shifts: tuple[int, ...]) -> Indices:
-        """Cells moved by all combinations of shifts along the refined axes, in units of cells of `level`."""
-        offsets = [
-            sum(step * shift for step, shift in zip(self._steps, combination, strict=True))
-            for combination in itertools.product(shifts, repeat=len(self._steps))
-        ]
-        stride = 1 << self.depth - level
-        return np.unique(cells[:, None] + stride * np.array(offsets, np.int64))
+    def _shift_cells(self, cells: Indices, level: int, shifts: tuple[int, ...], along: int | None = None) -> Indices:
+        """Cells moved by all combinations of shifts along the refined axes but `along`, in units of cells of `level`."""
+        offsets = _all_sums(step * np.array(shifts) for axis, step in enumerate(self._steps) if axis != along)
+        return np.unique(cells[:, None] + (offsets << self.depth - level))
 
     def parents(self, cells: Indices, level: int) -> Indices:
         """The cells of the level before that contain cells of `level`."""
@@ -118,13 +110,8 @@ class CellGrid:
         """Yield the edges of cells of `level`, axis by axis: the axis, lower ends, upper ends."""
         stride = 1 << self.depth - level
         for axis, step in enumerate(self._steps):
-            starts = np.unique(cells[:, None] + stride * np.array(self._edge_offsets(axis), np.int64))
+            starts = self._shift_cells(cells, level, (0, 1), axis)
             yield axis, starts, starts + stride * step
-
-    def _edge_offsets(self, axis: int) -> list[int]:
-        """Offsets of the lower ends of a unit cell's edges along an axis."""
-        steps_across = [step for a, step in enumerate(self._steps) if a != axis]
-        return [sum(offsets) for offsets in itertools.product(*((0, step) for step in steps_across))]
 
     def cells_around(self, axis: int, starts: Indices, level: int) -> Indices:
         """The cells of `level` that share edges along an axis, by the lower ends of these edges."""
@@ -136,6 +123,11 @@ class CellGrid:
                 above, below = cells[coordinate + stride < size], cells[coordinate >= stride] - stride * step
                 cells = np.concatenate([above, below])
         return np.unique(cells)
+
+
+def _all_sums(columns: Iterable[np.ndarray]) -> Indices:
+    """All sums of one number of each column, those of the last column fastest."""
+    return np.asarray(sum(np.ix_(*columns)), np.int64).ravel()
 
 
 def refine_boundary(

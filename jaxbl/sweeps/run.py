@@ -92,61 +92,62 @@ class RunTotals(NamedTuple):
         return totals._replace(fallback_reasons=tuple(dict.fromkeys(totals.fallback_reasons)))
 
 
+class MemoryStore(dict[int, pd.DataFrame]):
+    """Rows of chunks by index, in place of a :class:`jaxbl.sweeps.store.Store`, for a study without a folder."""
+
+    damaged = ()
+    write_part = dict.__setitem__
+
+    def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:
+        """Return the rows of a chunk, with all columns; None if it is not computed."""
+        return self.get(index)
+
+    def set_totals(self, *totals: int, final: bool = False) -> None:
+        """Do nothing: no other process reads them."""
+
+    def frame(self) -> pd.DataFrame:
+        """Return all rows."""
+        return pd.concat([self[index] for index in sorted(self)], ignore_index=True)
+
+
 class StudyRun:
     """Computes the chunks of a study that are not stored, one after the other.
 
     Args:
         engine: computes a chunk.
-        store: stores the chunks; left out, they stay in memory.
+        store: stores the chunks, a :class:`jaxbl.sweeps.store.Store` or a :class:`MemoryStore`.
         progress: called with finished and total lanes.
-        indices: indices of the chunks to compute, in their order; left out, all chunks of the study.
 
     Attributes:
         worker_totals: totals of the workers of a cluster.
     """
 
-    def __init__(
-        self, engine: Engine, store: Store | None, progress: Progress | None = None, indices: Sequence[int] | None = None
-    ):
-        self.engine, self.progress = engine, progress
+    def __init__(self, engine: Engine, store: Any, progress: Progress | None = None):
+        self.engine, self.store, self.progress = engine, store, progress
         self.worker_totals = RunTotals()
-        self._lanes = 0
-        self._store, self._indices = store, indices
-        self._frames: dict[int, pd.DataFrame] = {}
-        self._done = self._next = 0
+        self._lanes = self._done = self._next = 0
         self._chunks, self._total = len(engine), engine.rows
 
     @property
     def totals(self) -> RunTotals:
         """Totals of this process and of the workers."""
-        engine, damaged = self.engine, () if self._store is None else tuple(self._store.damaged)
+        engine, damaged = self.engine, tuple(self.store.damaged)
         totals = RunTotals(self._lanes, engine.compile_seconds, engine.run_seconds, tuple(engine.fallback_reasons), damaged)
         return totals + self.worker_totals
 
-    @property
-    def store(self) -> Store:
-        """The store of a run that has one."""
-        assert self._store is not None
-        return self._store
-
-    def frame(self) -> pd.DataFrame:
-        """All rows of a run without a store."""
-        return pd.concat([self._frames[index] for index in sorted(self._frames)], ignore_index=True)
+    def compute_share(self, indices: Sequence[int]) -> None:
+        """Compute the chunks with some indices, in their order; the progress is of these."""
+        self._chunks, self._total = len(indices), sum(self.engine.chunk(index).lanes for index in indices)
+        self.compute_missing(map(self.engine.chunk, indices))
 
     def compute_all(self) -> None:
-        """Compute the whole study, or the chunks that were asked for."""
+        """Compute the whole study."""
         if self.engine.points.refinement is None:
-            if self._indices is not None:
-                self._chunks = len(self._indices)
-                self._total = sum(self.engine.chunk(index).lanes for index in self._indices)
-            self.compute_missing(
-                map(self.engine.chunk, self.engine.chunk_order() if self._indices is None else self._indices)
-            )
+            self.compute_missing(map(self.engine.chunk, self.engine.chunk_order()))
             return
         for group in range(len(self.engine.points.groups)):
             self._refine(group)
-        if self._store is not None:
-            self._store.set_totals(self._chunks, self._total, final=True)
+        self.store.set_totals(self._chunks, self._total, final=True)
 
     def mark_finished(self) -> None:
         """Write into the manifest that all parts are stored."""
@@ -167,8 +168,7 @@ class StudyRun:
             self._total += (len(points) - counted) * sweep.seeds
             self._chunks += self.engine.count_chunks(len(points)) - self.engine.count_chunks(counted)
             counted = 0
-            if self._store is not None:
-                self._store.set_totals(self._chunks, self._total)
+            self.store.set_totals(self._chunks, self._total)
             chunks = self.engine.split_points(group, points, self._next)
             self._next += len(chunks)
             self.compute_missing(chunks)
@@ -191,13 +191,12 @@ class StudyRun:
 
         If an interrupt ends this, the chunks that were computed are written first.
         """
-        write = self._frames.__setitem__ if self._store is None else self._store.write_part
         computed: tuple[Chunk, Future[None]] | None = None
         with ThreadPoolExecutor(1) as writer:
             for chunk in self.missing_chunks(chunks):
                 frame = self.engine.run(chunk)
                 self._lanes += len(frame)
-                before, computed = computed, (chunk, writer.submit(write, chunk.index, frame))
+                before, computed = computed, (chunk, writer.submit(self.store.write_part, chunk.index, frame))
                 # frames are large: at most one waits to be written
                 self._await_part(before)
             self._await_part(computed)
@@ -219,10 +218,8 @@ class StudyRun:
 
     def _read_chunk(self, chunk: Chunk, *columns: str) -> pd.DataFrame | None:
         """Read columns of a chunk; None if it is not stored, or if the part of a refined study has other points."""
-        if self._store is None:
-            return self._frames.get(chunk.index)
         labels = {} if self.engine.points.refinement is None else self.engine.row_labels(chunk)
-        frame = self._store.read_part(chunk.index, (*labels, *columns))
+        frame = self.store.read_part(chunk.index, (*labels, *columns))
         if frame is None or any(not np.array_equal(frame[name].to_numpy(), column) for name, column in labels.items()):
             return None
         return frame

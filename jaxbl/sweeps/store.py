@@ -36,7 +36,7 @@ from jaxbl.files import (
 from jaxbl.json_types import JsonObject
 
 from . import parts
-from .parts import Damaged, PartHeader
+from .parts import PartHeader
 from .programs import Backend, Layout
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def load_config(folder: Path) -> Config:
 def _recover_study(folder: Path) -> ResultFolder | None:
     """Return the folder of a study whose manifest is lost or damaged, by its first whole part; None without one."""
     for path in list_paths(folder / "points", "part-*.parquet"):
-        with suppress(Damaged, FileNotFoundError):
+        with suppress(DamagedFile, FileNotFoundError):
             study, layout, backend, _ = parts.read_part(path, ())[0]
             subject = Subject("study", study["title"] or "untitled", study["single_run"])
             entry = study | {"layout": layout, "backend": backend, "finished": False, "files": {}, "folders": FOLDERS}
@@ -157,11 +157,10 @@ class Store:
             "folders": FOLDERS,
         }
         store = cls(results)
-        store.manifest["parts"] = len(engine)
         if engine.points.refinement is not None:
             # the files are the only record of how many parts there were if the manifest was lost
-            last = max(map(store._index_of, store.list_part_files()), default=-1)
-            store.manifest["parts"] = max(len(engine), before.get("parts", 0), last + 1)
+            last = max(store.list_part_files().values(), default=-1)
+            store.manifest["parts"] = max(store.manifest["parts"], last + 1)
         # the manifest first: it reserves the folder for this study
         results.write_manifest()
         if not is_remote(folder):
@@ -200,78 +199,67 @@ class Store:
     def part_path(self, index: int) -> Path:
         return self.folder / "points" / f"part-{index:05d}.parquet"
 
-    def list_part_files(self) -> list[Path]:
-        """All files among the parts, whole or damaged, in the order of their indices."""
-        # names with six digits come after those with five
-        return sorted(list_paths(self.folder / "points", "part-*.parquet"), key=lambda path: (len(path.name), path.name))
-
-    def _index_of(self, path: Path) -> int:
-        """Index of the part in a file, by its name; -1 if no part has that name."""
-        number = path.stem.removeprefix("part-")
-        return int(number) if number.isdecimal() and path == self.part_path(int(number)) else -1
+    def list_part_files(self) -> dict[Path, int]:
+        """All files among the parts, whole or damaged, with their indices by their names; -1 if no part has that name."""
+        indices = {}
+        for path in list_paths(self.folder / "points", "part-*.parquet"):
+            number = path.stem.removeprefix("part-")
+            is_part = number.isdecimal() and path == self.part_path(int(number))
+            indices[path] = int(number) if is_part else -1
+        return indices
 
     def list_indices(self) -> list[int]:
         """Indices of the stored parts. Raises `InputError` if a file among them is not a part of this study."""
-        indices = {path: self._index_of(path) for path in self.list_part_files()}
+        indices = self.list_part_files()
         for path, index in indices.items():
             if not 0 <= index < self.manifest["parts"]:
                 raise InputError(f"{path}: is no part of this study, which has {self.manifest['parts']}; move it away")
-        return list(indices.values())
+        return sorted(indices.values())
 
     def write_part(self, index: int, frame: pd.DataFrame) -> None:
         """Write the rows of a chunk. The store itself does not change, so that this may run in another thread."""
         head = {name: self.manifest[name] for name in ("identity", "single_run", "title")}
         parts.write_part(self.part_path(index), frame, PartHeader(head, self.manifest["layout"], self.backend, index))
 
-    def has_part(self, index: int) -> bool:
-        """True if the part of a chunk is stored and whole. Otherwise as :meth:`read_part`."""
-        return self.read_part(index, ()) is not None
-
     def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:
         """Read columns of a chunk; None if its part is not stored. A damaged one is moved to `damaged/`. Raises `InputError`
         if the part is of another study."""
         path, folder = self.part_path(index), self.folder / "damaged"
         try:
-            return self._read(index, path, columns)
+            return self._read(index, columns)
         except FileNotFoundError:
             return None
-        except Damaged as damage:
+        except DamagedFile as damage:
             names = (f"{path.name}.{i}" if i else path.name for i in count())
             target = next(folder / name for name in names if not (folder / name).exists())
             move_file(path, target)
-            self.damaged.append(f"points/{path.name} {damage}; it is kept as damaged/{target.name}")
+            self.damaged.append(f"points/{path.name} {damage.reason}; it is kept as damaged/{target.name}")
             return None
 
-    def _read(self, index: int, path: Path, columns: Sequence[str] | None, *, check: bool = True) -> pd.DataFrame:
-        """Read columns of a chunk from a file. Raises `InputError` if it is of another study, else as `parts.read_part`."""
-        header, frame = parts.read_part(path, columns, check=check)
+    def _read(
+        self, index: int, columns: Sequence[str] | None, *, check: bool = True, copy: Path | None = None
+    ) -> pd.DataFrame:
+        """Read columns of a chunk from its file or a copy. Raises `InputError` if it is of another study, else as
+        `parts.read_part`."""
+        part = self.part_path(index)
+        header, frame = parts.read_part(copy or part, columns, check=check)
         if header.study.get("identity") != self.manifest["identity"]:
             title = header.study.get("title") or "untitled"
             raise InputError(
-                f"{self.part_path(index)}: is of another study ('{title}', other numbers); move it away, and run 'jaxbl "
+                f"{part}: is of another study ('{title}', other numbers); move it away, and run 'jaxbl "
                 "sweep' again, which computes this part"
             )
         if header.chunk != index or header.layout != self.manifest["layout"]:
-            raise Damaged(f"is part {header.chunk} of this study")
+            raise DamagedFile(part, f"is part {header.chunk} of this study", parts.RECOMPUTE)
         return frame
-
-    def _read_whole(self, index: int, path: Path, columns: Sequence[str] | None, check: bool) -> pd.DataFrame:
-        """Read as :meth:`_read` does, with an `InputError` for a part that is damaged, too."""
-        try:
-            return self._read(index, path, columns, check=check)
-        except Damaged as damage:
-            raise InputError(
-                f"{self.part_path(index)}: is damaged ({damage}); run 'jaxbl sweep' again, which moves it to damaged/ and "
-                "computes it anew"
-            ) from None
 
     def set_totals(self, parts: int, rows: int, *, final: bool = False) -> None:
         """Set the numbers of parts and rows of a refined study that have grown or are final; remove parts beyond these."""
         if final or rows > self.manifest["rows"]:
             self.update_manifest(parts=parts, rows=rows)
         if final:
-            for path in self.list_part_files():
-                if self._index_of(path) >= parts:
+            for path, index in self.list_part_files().items():
+                if index >= parts:
                     path.unlink()
 
     def columns(self) -> list[str]:
@@ -284,7 +272,7 @@ class Store:
         Each file is compared with its checksum when it is read first, and each page whenever it is read. Raises
         `InputError` if a part is damaged, or not of this study."""
         for index in self._indices_to_read():
-            frame = self._read_whole(index, self._local_copy(index), columns, index not in self._checked)
+            frame = self._read(index, columns, check=index not in self._checked, copy=self._local_copy(index))
             self._checked.add(index)
             yield frame
 
@@ -304,7 +292,7 @@ class Store:
 
         indices = self._indices_to_read()
         for index in indices:
-            self._read_whole(index, self.part_path(index), (), check)
+            self._read(index, (), check=check)
         file_format = dataset.ParquetFileFormat(
             default_fragment_scan_options=dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         )
@@ -323,13 +311,13 @@ class Store:
             weakref.finalize(self, shutil.rmtree, self._copy_folder, ignore_errors=True)
         copy = self._copy_folder / part.name
         if not copy.exists():
-            copy.write_bytes(part.read_bytes())
+            copy.write_bytes(parts.read_checked(part))
         return copy
 
     def verify(self) -> int:
         """Read all stored parts, move damaged ones to `damaged/`, and return the number of whole ones. Raises `InputError`
         if a part is of another study, or has an index that this study does not have."""
-        whole_parts = sum(map(self.has_part, self._indices_to_read()))
+        whole_parts = sum(self.read_part(index, ()) is not None for index in self._indices_to_read())
         if self.damaged:
             self.update_manifest(finished=False)
         return whole_parts

@@ -17,11 +17,11 @@ from jaxbl.errors import InputError
 from jaxbl.files import MANIFEST, lock_folder, to_path
 from jaxbl.workers import Progress
 
-from .bundles import ClusterRun, submit_chunks
+from .bundles import ClusterRun
 from .engine import Engine, SweepEstimate
 from .metrics import find_metric
 from .programs import Backend
-from .run import StudyRun, join_store, open_or_create_store
+from .run import MemoryStore, StudyRun, join_store, open_or_create_store
 from .status import Status, status
 from .store import Store, load_config
 
@@ -195,9 +195,10 @@ def sweep(
             raise InputError("--scheduler: its workers write into a folder; name it with --out")
         if backend == "fused":
             engine.compile_all()
-        run = StudyRun(engine, None, progress)
+        memory = MemoryStore()
+        run = StudyRun(engine, memory, progress)
         run.compute_all()
-        return _make_result(run, run.frame())
+        return _make_result(run, memory.frame())
     folder = to_path(out)
     if backend == "fused" and not (folder / MANIFEST).exists():
         # a backend that cannot run the study is refused before anything is written
@@ -228,7 +229,7 @@ def _make_engine(study: ConfigSource, backend: Backend | None, devices: list[Any
 
 def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
     totals = run.totals
-    cost = {"compile_seconds": totals.compile_seconds, "run_seconds": totals.run_seconds, "lanes": totals.lanes}
+    cost = {name: getattr(totals, name) for name in ("compile_seconds", "run_seconds", "lanes")}
     return StudyResult(run.engine.config, source, cost, totals.fallback_reasons, totals.damaged)
 
 
@@ -262,7 +263,7 @@ def share(
     _check_independent(engine, "--share")
     number, count = portion
     with join_store(folder, engine) as (engine, store):
-        StudyRun(engine, store, progress, engine.chunk_order()[number - 1 :: count]).compute_all()
+        StudyRun(engine, store, progress).compute_share(engine.chunk_order()[number - 1 :: count])
     return status(folder)
 
 
@@ -288,7 +289,7 @@ def submit(
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
         with join_store(folder, engine) as (engine, store):
-            submit_chunks(cluster, engine, store)
+            ClusterRun(cluster, engine, store).submit_missing()
     return status(folder)
 
 

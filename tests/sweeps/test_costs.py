@@ -10,7 +10,7 @@ from small_study import ALPHA, LAMBDA, NOISE, small_study
 import jaxbl.sweeps.costs as under_test
 from jaxbl.config import read_config
 from jaxbl.fused import program_cache
-from jaxbl.sweeps.costs import Cost, Costs, Operations, choose_backend, count_operations, measure_costs
+from jaxbl.sweeps.costs import Cost, Costs, Operations, Work, choose_backend, count_operations, measure_costs
 from jaxbl.sweeps.programs import Layout
 
 MADE_UP_COSTS = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
@@ -75,9 +75,8 @@ def test_measured_once_where_programs_are_kept(monkeypatch, tmp_path):
 
 def test_the_backend_that_takes_less_time():
     def choose(platform, layout, samples=10**7, devices=1, programs=1):
-        backends = dict.fromkeys(("fused", "scan"), Layout(*layout)), dict.fromkeys(("fused", "scan"), samples)
-        operations = dict.fromkeys(("fused", "scan"), Operations(300.0, 100.0, 200.0, 800))
-        return choose_backend([SimpleNamespace(platform=platform)] * devices, operations, *backends, programs)
+        work = Work(Operations(300.0, 100.0, 200.0, 800), Layout(*layout), samples)
+        return choose_backend([SimpleNamespace(platform=platform)] * devices, {"fused": work, "scan": work}, programs)
 
     assert choose("cpu", (1, 3)) == "fused"
     # seed after seed would pay for each what lanes share

@@ -111,7 +111,7 @@ def test_a_chunk_that_is_not_whole_is_computed_again(study_copy, finished_study,
     elif damage == "empty":
         part.touch()
     elif damage == "draft only":
-        part.with_name(f".{part.name}.1").write_bytes(content[:100])
+        part.with_name(f".draft.1.{part.name}").write_bytes(content[:100])
     if damage in ("truncated", "empty"):
         with pytest.raises(InputError, match=r"part-00001\.parquet: is damaged \(.*\); run 'jaxbl sweep' again"):
             _ = open_study(study_copy).frame
@@ -477,7 +477,7 @@ def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
     assert (
         stored_study.dataset().to_table(columns=["seed"]).to_pandas()["seed"].tolist() == stored_study.frame["seed"].tolist()
     )
-    assert open_study(tmp_path).source.has_part(100_000)
+    assert open_study(tmp_path).source.read_part(100_000, ()) is not None
 
 
 def test_a_study_in_an_object_store_is_read_alike(finished_study):
@@ -489,6 +489,27 @@ def test_a_study_in_an_object_store_is_read_alike(finished_study):
     for check in (True, False):
         table = stored_study.dataset(check=check).to_table(columns=[ALPHA, "seed"]).to_pandas()
         pd.testing.assert_frame_equal(table, finished_study[1].frame[[ALPHA, "seed"]])
+
+
+def test_a_store_that_does_not_answer_has_no_damage(finished_study, monkeypatch):
+    """It was taken for damage, and moving the part aside ended in a traceback."""
+    address = UPath("memory://silent/study")
+    for name, content in read_files(finished_study[0]).items():
+        (address / name).write_bytes(content)
+    read = type(address).read_bytes
+
+    def refuse_parts(path):
+        if path.suffix == ".parquet":
+            raise ConnectionError("timed out")
+        return read(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(address), "read_bytes", refuse_parts)
+        for call in (lambda: sweep(study(), str(address)), lambda: open_study(str(address)).frame):
+            with pytest.raises(InputError, match=r"part-00000\.parquet: cannot be read \(timed out\); name another folder"):
+                call()
+    assert not (address / "damaged").exists()
+    pd.testing.assert_frame_equal(open_study(str(address)).frame, finished_study[1].frame)
 
 
 def test_the_metrics_asked_for_are_a_sweeps_own():
