@@ -34,6 +34,8 @@ NamedArrays = dict[str, np.ndarray]
 TracedArrays = dict[str, Array]
 """The same inside a traced function."""
 Number = Any  # a number of one lane: Float[Array, ""] inside a step
+Count = Int[Array, ""]
+"""Index of a sample or of a plant step, or a seed."""
 
 
 class Run(eqx.Module):
@@ -314,13 +316,13 @@ def find_missed(measured: TracedArrays, torque: Number) -> TracedArrays:
 
 def begin_sample(
     plant: Plant, run: Run, state: PlantState, torque: Scalar, time: Number
-) -> tuple[PlantState, Callable[[Int[Array, ""], PlantState], PlantState]]:
+) -> tuple[PlantState, Callable[..., PlantState]]:
     """The state with the `torque` (N m) that arrives at a sample (at `time`, s) and is held until the next one, and the
     plant's step from there, by its number."""
     period = run.sample_period / run.substeps
     effects, arriving_torque = plant.receive(state.effects, torque, run.sample_period)
 
-    def substep(i: Int[Array, ""], state: PlantState) -> PlantState:
+    def substep(i: Count, state: PlantState) -> PlantState:
         return plant.advance(state, arriving_torque(i * period, period), time + i * period, period)
 
     return PlantState(state.position, state.velocity, effects), substep
@@ -346,7 +348,7 @@ class Reducer(NamedTuple):
     """
 
     init: Callable[[Experiment], Any]
-    update: Callable[[Experiment, Any, Int[Array, ""], Signals], Any]
+    update: Callable[[Experiment, Any, Count, Signals], Any]
     result: Callable[[Experiment, Any, State], TracedArrays]
     done: Callable[[Experiment, Any, State], Array] | None = None
 
@@ -354,7 +356,7 @@ class Reducer(NamedTuple):
 Reducers = tuple[Reducer, ...]
 
 
-def unit_noise(seed: Int[Array, ""], indices: Int[Array, " samples"], sides: tuple[str, ...]) -> TracedArrays:
+def unit_noise(seed: Count, indices: Int[Array, " samples"], sides: tuple[str, ...]) -> TracedArrays:
     """Draw standard normal noise for each side, shape (samples,), which depends on seed and sample index alone.
 
     Runs with the same seed have common random numbers. The draws are float32 in all runs, so that both precisions see the
@@ -384,7 +386,7 @@ def initial_carry(experiment: Experiment, reducers: Reducers, state: State | Non
 
 
 def advance_sample(
-    experiment: Experiment, reducers: Reducers, carry: Carry, index: Int[Array, ""], *sample_inputs: Any
+    experiment: Experiment, reducers: Reducers, carry: Carry, index: Count, *sample_inputs: Any
 ) -> tuple[Carry, Signals]:
     """Advance the carry by sample `index`, and return the signals there.
 
@@ -427,7 +429,7 @@ def all_done(experiment: Experiment, reducers: Reducers, carry: Carry) -> Array 
 
 def scan(
     experiment: Experiment,
-    seed: Int[Array, ""],
+    seed: Count,
     reducers: Reducers = (),
     record: Callable[[State, Signals], Any] | None = None,
     stride: int = 1,

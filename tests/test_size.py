@@ -17,24 +17,25 @@ from size import ROOT, Size, measure_file, measure_folders
 # feedback; `records` by files without telling names, and `fused` by compilation, which moved
 # there from `estimation`. `report` pays for all; it has maps of the best observer at each point again, which docs/theory.md
 # shows. `drive` has a bound of what a flexible part is and, with `config`, friction under load of one inertia; `cli` and
-# `records` say first what a proposed model leaves open.
+# `records` say first what a proposed model leaves open. `.` holds the first half of a sample's plant steps (`begin_sample`),
+# which derivatives share, and `cli` proposes no comparison where no point is common: 34 and 17 tokens.
 CEILINGS = {
-    "all": (392084, 0.02, 0.2, 0.0),
-    "report": (45486, 0.04, 0.56, 0.0),
-    "diagnosis": (57843, 0.0, 0.0, 0.0),
-    "records": (53050, 0.0, 0.0, 0.0),
-    "gains": (38771, 0.0, 0.0, 0.0),
+    "all": (386772, 0.02, 0.2, 0.0),
+    "report": (44265, 0.04, 0.56, 0.0),
+    "diagnosis": (57842, 0.0, 0.0, 0.0),
+    "records": (51367, 0.0, 0.0, 0.0),
+    "gains": (38229, 0.0, 0.0, 0.0),
     "estimation": (32273, 0.0, 0.0, 0.0),
-    "sweeps": (29950, 0.08, 0.0, 0.0),
-    "exports": (24343, 0.02, 0.0, 0.0),
-    "fused": (25356, 0.0, 0.0, 0.0),
-    ".": (23220, 0.0, 0.0, 0.0),
+    "sweeps": (29030, 0.08, 0.0, 0.0),
+    "exports": (23481, 0.02, 0.0, 0.0),
+    "fused": (25285, 0.0, 0.0, 0.0),
+    ".": (23254, 0.0, 0.0, 0.0),
     "drive": (13318, 0.0, 1.6, 0.0),
     "throughput": (10661, 0.0, 0.0, 0.0),
-    "cli": (9756, 0.09, 0.0, 0.0),
-    "config": (10500, 0.0, 0.0, 0.0),
+    "cli": (9773, 0.09, 0.0, 0.0),
+    "config": (10498, 0.0, 0.0, 0.0),
     "observer": (9184, 0.0, 0.0, 0.0),
-    "monitoring": (5877, 0.0, 0.0, 0.0),
+    "monitoring": (5816, 0.0, 0.0, 0.0),
     "control": (2496, 0.0, 0.0, 0.0),
 }
 

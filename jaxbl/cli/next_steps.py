@@ -76,9 +76,10 @@ def after_inspection(log: Path, model: Path | None) -> list[NextStep]:
     return [_propose("What would a first model look like?", "inspect", log, "--write", f"{log.stem}.toml")]
 
 
-def after_comparison(folder: Path) -> list[NextStep]:
-    """Propose to look at the points of both studies."""
-    return [_propose("At which points do they differ, and how much? Maps in the browser.", "explore", folder)]
+def after_comparison(card: "Result", folder: Path) -> list[NextStep]:
+    """Propose to look at the points of both studies, if they have some."""
+    step = _propose("How much do they differ, point by point? Maps in the browser.", "explore", folder)
+    return [step] * (card.verdict != "no answer")
 
 
 def after_proposal(log: Path, model: Path) -> list[NextStep]:

@@ -399,8 +399,8 @@ def compare(
         open_results(folder, Subject("comparison")) as results,
     ):
         comparison = jaxbl.compare(*studies)
-        card = replace(jaxbl.describe(comparison), next_steps=after_comparison(folder))
-        card = jaxbl.write_report(comparison, results, card)
+        card = jaxbl.describe(comparison)
+        card = jaxbl.write_report(comparison, results, replace(card, next_steps=after_comparison(card, folder)))
     return Outcome(card, folder, summary="comparison.json")
 
 

@@ -274,7 +274,7 @@ class Predictor:
 def _figures(experiment: Experiment) -> tuple[Any, dict[str, Any]]:
     """Gain of the input, and inertia of each side over its ratio, kg m^2: as one program."""
     plant = experiment.plant
-    return plant.input_gain, {side: plant.inertia(side) / experiment.drive.ratio(side) for side in experiment.sides}
+    return plant.input_gain, {side: plant.inertia(side) / plant.drive.ratio(side) for side in plant.drive.sides}
 
 
 def find_driving_torque(experiment: Experiment, segments: Sequence[Segment]) -> tuple[float, bool]:

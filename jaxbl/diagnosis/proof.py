@@ -99,11 +99,10 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     record, log = open_held_out(setup)
     if setup.task.separate:
         chosen, log = _take_zeros(chosen, log)
-    fitted, nominal = chosen.fitted, setup.nominal
-    before, after = log.compare(nominal), log.compare(fitted.experiment)
+    fitted = chosen.fitted
+    before, after = log.compare(setup.nominal), log.compare(fitted.experiment)
     expected = expected_errors(log, fitted, after, setup.input_noise, chosen.driving)
-    driving, _ = find_driving_torque(fitted.experiment, log.segments)
-    sizes = _sizes(log, fitted.experiment, driving)
+    sizes = _sizes(log, fitted.experiment)
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
     return Proof(
@@ -113,7 +112,7 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
         weak,
         _find_untested(setup, chosen, log, expected),
-        _describe_gap(setup, record, log, before, after, driving),
+        _describe_gap(setup, record, log, before, after, sizes["torque_motor"]),
     )  # fmt: skip
 
 
@@ -127,9 +126,10 @@ def _reach(log: ReferenceLog) -> Errors:
     return reach | {"torque_motor": float(np.max(np.abs(torques)))}
 
 
-def _sizes(log: ReferenceLog, experiment: Experiment, driving: float) -> Errors:
+def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
     """Size of what is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives
-    it, N m, rms; `driving`: that at the motor."""
+    it, N m, rms."""
+    driving, _ = find_driving_torque(experiment, log.segments)
     sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
     return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
 

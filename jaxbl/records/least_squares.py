@@ -69,6 +69,11 @@ class BlockRegression:
         unit, size = _scale_matrix(total[:-1, :-1] + self.penalty)
         return np.linalg.lstsq(unit, total[:-1, -1] / size, rcond=1e-12)[0] / size
 
+    @property
+    def unit_matrix(self) -> tuple[np.ndarray, np.ndarray]:
+        """Products of the columns over their sizes, and these; infinite of a column of zeros."""
+        return _scale_matrix(self.products.sum(axis=0)[:-1, :-1] + self.penalty)
+
     def fit_without_each(self) -> np.ndarray:
         """Fit the coefficients without each of the blocks, shape (blocks, columns)."""
         return np.array([self.fit([block]) for block in range(len(self.products))])
@@ -100,7 +105,7 @@ def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.n
         Coefficients and standard errors of :class:`BlockRegression`, shape (terms,); NaN if they are not determined.
     """
     regression = BlockRegression.of(target, regressors)
-    unit, size = _scale_matrix(regression.products.sum(axis=0)[:-1, :-1])
+    unit, size = regression.unit_matrix
     if not np.linalg.cond(unit) <= 1e13:
         return np.full(len(size), np.nan), np.full(len(size), np.nan)
     return regression.fit(), regression.errors()

@@ -77,6 +77,11 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
         figures.append(KeyFigure(str(number), f"{finding['effect']}: {leaf}"))
         figures.append(KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"))
+    elif summary.get("numbers_off"):
+        numbers = read_quantities(summary["parameters"])
+        changes = {path: abs(np.log(number.factor)) for path, number in numbers.items() if number.factor > 0.0}
+        for path in sorted(changes, key=lambda path: -changes[path])[:1]:
+            figures.append(KeyFigure(str(numbers[path]), f"{path}, {numbers[path].nominal:g} in the model: furthest off"))
     return figures
 
 

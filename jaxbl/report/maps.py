@@ -161,12 +161,16 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
+def value_words(value: str) -> str:
+    """The words for a metric: side and label."""
+    side, label = value.rpartition(".")[0], find_metric(value).label
+    label = f"|{label}|" if is_magnitude(value) else label
+    return f"{side}: {label}" if side else label
+
+
 def value_label(value: str) -> str:
     """The words of an axis or a colour bar for a metric: side, label, unit."""
-    side, _, _ = value.rpartition(".")
-    metric = find_metric(value)
-    label = f"|{metric.label}|" if is_magnitude(value) else metric.label
-    return with_unit(f"{side}: {label}" if side else label, metric.unit)
+    return with_unit(value_words(value), find_metric(value).unit)
 
 
 def _over(config: Config, varied: set[str], spec: FigureTable) -> str:

@@ -7,18 +7,20 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+from jaxbl.config import is_boolean
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.lines import percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
+from jaxbl.sweeps.metrics import find_metric, is_magnitude
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Groups, Rows
 from .checks import values_of
-from .maps import best_gains, draw as draw, laws_of, slope_text, worst_runs
+from .maps import best_gains, draw as draw, laws_of, slope_text, value_words, worst_runs
 
 
 def write(result: StudyResult, folder: Path) -> str:
@@ -69,6 +71,8 @@ def answer_sweep(result: StudyResult) -> Result:
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
     verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
+    # the headline has the first
+    figures += survey.list_ranges()[1:]
     tables = [
         ResultTable(
             f"{side}: which axis matters for the velocity error",
@@ -99,6 +103,8 @@ class _Survey:
         converged: how many of the even ones converged, by side; none where the study does not say.
         best: the best gains, by side, and the worst runs with each pair of gains; none where the study does not say.
         importance: axes by what they explain of the velocity error, by side; of random designs alone.
+        ranges: where the study does not say what converged: least and largest number of each metric that its figures show,
+            and how many are 0.
     """
 
     def __init__(self, result: StudyResult):
@@ -111,13 +117,18 @@ class _Survey:
         self.runs = self.even = self.diverged = 0
         self.converged = {side: 0 for side in config.sides if f"{side}.converged" in metrics}
         self.best, self.importance = {}, {}
-        for frame in result.batches([*paths, "seed", "finite", *metrics]):
+        drawn = [] if self.converged else [figure.value for figure in config.figures if not is_boolean(figure.value)]
+        self.ranges = {column: (math.inf, -math.inf, 0) for column in drawn if column in result.columns}
+        for frame in result.batches([*paths, "seed", "finite", *metrics, *self.ranges]):
             even = frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
             self.even += len(even)
             self.diverged += (~frame["finite"].astype(bool)).sum()
             for side in self.converged:
                 self.converged[side] += even[f"{side}.converged"].sum()
+            for column, (low, high, zeros) in self.ranges.items():
+                values = frame[column].abs() if is_magnitude(column) else frame[column]
+                self.ranges[column] = min(low, values.min()), max(high, values.max()), zeros + (values == 0.0).sum()
         varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
         for side in config.sides:
             error, gains = f"{side}.velocity_rmse", [path for path in varied if path.startswith(f"observer.{side}.")]
@@ -128,6 +139,14 @@ class _Survey:
                 groups = Groups(Rows(result, columns), gains, paths)
                 runs = worst_runs(groups, error)
                 self.best[side] = best_gains(runs), runs
+
+    def list_ranges(self) -> list[KeyFigure]:
+        """From where to where metrics go, and in how many runs they are 0."""
+        figures = []
+        for column, (low, high, zeros) in self.ranges.items():
+            none = f" (0 in {percent(zeros / self.runs)} of the runs)" if zeros else ""
+            figures.append(KeyFigure(f"{low:.3g} to {high:.3g} {find_metric(column).unit}{none}", value_words(column)))
+        return figures
 
 
 def _headline(result: StudyResult, survey: _Survey) -> str:
@@ -144,7 +163,9 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()
     ]
-    return f"{runs}: {'; '.join(shares)}." if shares else f"{runs}."
+    if not shares:
+        return "; ".join([runs, *(f"{metric} goes from {ends}" for ends, metric in survey.list_ranges()[:1])]) + "."
+    return f"{runs}: {'; '.join(shares)}."
 
 
 def _explain_ends(law: Law) -> str:

@@ -34,6 +34,15 @@ def test_a_report_makes_its_folder_and_says_its_lines(study, tmp_path):
     assert sorted(file.name for file in (tmp_path / "a" / "b").iterdir()) == ["figures", "manifest.json", "report.html"]
 
 
+def test_a_sweep_that_asks_for_other_metrics_says_where_they_go(study, tmp_path):
+    """Without convergence among the metrics the first sentence is on those that the figures show."""
+    tables = {"axes": study.config.to_dict()["axes"], "figures": study.config.to_dict()["figures"]}
+    result = jaxbl.describe(make_result(rigid_study({"sweep.metrics": ["chatter", "velocity_rmse"]}, **tables)))
+    assert result.headline.startswith("20 runs; motor: ") and " goes from " in result.headline
+    (error,) = result.key_figures
+    assert error.meaning == "motor: velocity error, rms" and error.value.endswith(" rad/s") and " to " in error.value
+
+
 def test_each_kind_of_result_goes_to_its_own_functions():
     for kind, functions in results._KINDS.items():
         calls = (getattr(functions.report, name) for name in ("describe", "draw", "write"))

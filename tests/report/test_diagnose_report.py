@@ -124,6 +124,15 @@ def test_numbers_that_are_further_off_come_first():
     off = SUMMARY | {"numbers_off": True}
     assert describe_diagnosis(off | {"findings": [], "verdict": "no_discrepancy"}).headline.startswith(FIRST_LINE)
     assert describe_diagnosis(off).headline.endswith(describe_diagnosis(SUMMARY).headline)
+    inertia = {"value": 0.06, "standard_error": 0.001, "unit": "kg m²", "nominal": 0.03}
+    viscous = inertia | {"unit": "N m s/rad", "nominal": 0.0}
+    numbers = {
+        "drive.motor_viscous": viscous,
+        "drive.motor_inertia": inertia,
+        "drive.load_inertia": inertia | {"nominal": 0.05},
+    }
+    result = describe_diagnosis(off | {"findings": [], "verdict": "no_discrepancy", "parameters": numbers})
+    assert result.key_figures[-1] == ("0.0600 ± 0.0010 kg m²", "drive.motor_inertia, 0.03 in the model: furthest off")
 
 
 def test_an_effect_that_may_as_well_be_something_unknown_is_there_perhaps():

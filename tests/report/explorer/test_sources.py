@@ -86,6 +86,13 @@ def test_a_comparison_is_a_map_of_factors(compared_folder, tmp_path):
     (compared_folder / "kept").rename(compared_folder / "comparison.parquet")
 
 
+def test_a_comparison_without_a_common_point_has_nothing_to_show(tmp_path):
+    first, second = (make_result(rigid_study(axes=[listed_axis(NOISE, noise)])) for noise in (1e-5, 1e-4))
+    write_report(compare(first, second), tmp_path)
+    with pytest.raises(InputError, match="no point is in both studies: there is nothing to show"):
+        open_source(tmp_path)
+
+
 def test_a_verdict_has_the_runs_of_the_sampled_observers(verified_study, tmp_path):
     verdict, folder = verified_study[0], tmp_path / "verified"
     shutil.copytree(verified_study[1], folder)
