@@ -1184,7 +1184,8 @@ def test_after_runs_and_searches_what_to_do_with_the_gains():
         "jaxbl export 'a b.toml' --gains out/gains.toml --out out_code",
     ]
     assert after_tuning(failed, file, folder) == []
-    assert [step.command for step in after_comparison(folder)] == ["jaxbl explore out"]
+    assert [step.command for step in after_comparison(failed, folder)] == ["jaxbl explore out"]
+    assert after_comparison(Result("t", "no answer", "."), folder) == []
 
 
 def test_the_page_of_an_inspected_log_says_how_to_go_on(call):
