@@ -78,7 +78,7 @@ def after_inspection(log: Path, model: Path | None) -> list[NextStep]:
 
 def after_comparison(card: "Result", folder: Path) -> list[NextStep]:
     """Propose to look at the points of both studies, if they have some."""
-    step = _propose("How much do they differ, point by point? Maps in the browser.", "explore", folder)
+    step = _propose("How do both look, point by point? Maps in the browser.", "explore", folder)
     return [step] * (card.verdict != "no answer")
 
 

@@ -75,8 +75,8 @@ def conditions_line(side: str, judged: JsonObject, source: str) -> str:
     if not judged["holds"]["exact"]:
         return f"{lead} λ = {lambda_:.3g} √rad/s is too small: it has to exceed {least:.3g} (exact condition)."
     return (
-        f"{lead} the gains are safe. λ may fall to {least:.3g} √rad/s ({lambda_ / least:.4g} times less), or f⁺ grow to "
-        f"{largest:.3g} rad/s² ({largest / bound:.4g} times more), until the exact condition fails."
+        f"{lead} the exact condition holds. λ may fall to {least:.3g} √rad/s ({lambda_ / least:.4g} times less), or f⁺ "
+        f"grow to {largest:.3g} rad/s² ({largest / bound:.4g} times more), until it fails."
     )
 
 

@@ -104,7 +104,7 @@ def _figure(name: str, picture: Picture) -> str:
 def _table(table: ResultTable) -> str:
     heading = escape(table.heading)
     head = "".join(f'<th scope="col">{_breakable(column)}</th>' if column else "<td></td>" for column in table.columns)
-    body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in table.rows)
+    body = "".join(f"<tr>{''.join(_cell(value, _digits(row)) for value in row)}</tr>" for row in table.rows)
     return (
         f'<h2>{heading}</h2><div class="scroll" tabindex="0" role="region" aria-label="{heading}">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
@@ -116,13 +116,19 @@ def _breakable(text: str) -> str:
     return re.sub(r"([._])(?=[a-z])", r"\1<wbr>", escape(text))
 
 
-def _cell(value: object) -> str:
+def _digits(row: Sequence[object]) -> int:
+    """Digits of the numbers of a row: 4, or up to 7 where only these tell them apart, as the ends of a narrow interval."""
+    numbers = {value for value in row if isinstance(value, float)}
+    return next((n for n in range(4, 7) if len({f"{value:.{n}g}" for value in numbers}) == len(numbers)), 7)
+
+
+def _cell(value: object, digits: int) -> str:
     if isinstance(value, bool | None):
         value = {True: "yes", False: "no", None: "–"}[value]
     if isinstance(value, str):
         return f"<td>{_breakable(value)}</td>"
     # counts in full
-    text = str(value) if isinstance(value, int | np.integer) else f"{value:.4g}"
+    text = str(value) if isinstance(value, int | np.integer) else f"{value:.{digits}g}"
     return f'<td class="number" data-value="{value}">{text}</td>'
 
 

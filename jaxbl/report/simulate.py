@@ -39,7 +39,7 @@ def describe(trial: Trial) -> Result:
     figures = []
     for side, quantity in quantities:
         error, largest = metrics[f"{side}.{quantity}_rmse"], limits.velocity_tolerance / drive.ratio(side)
-        bound = f"; the largest may be {largest:.3g}" if quantity == "velocity" else ""
+        bound = f"; at any time at most {largest:.3g} is allowed" if quantity == "velocity" else ""
         text = "diverges" if error is None else f"{error:.3g} {SIDE_METRICS[f'{quantity}_rmse'].unit}"
         figures.append(KeyFigure(text, f"{side}: {quantity} error, rms{bound}"))
     rows = [

@@ -70,6 +70,8 @@ def answer_sweep(result: StudyResult) -> Result:
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
     verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
+    # what nothing is asked of is neither good nor bad
+    verdict = "no answer" if survey.ranges and verdict == "good" else verdict
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
     # the headline has the first
     figures += survey.list_ranges()[1:]
@@ -158,7 +160,7 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         runs = f"{runs} at {simulated} of {points} grid points ({percent(simulated / points)})"
         among = " on the coarse grid"
     even = survey.even or math.nan
-    works = {side: ", with the best gains in all" for side, (best, _) in survey.best.items() if best is not None}
+    works = {side: ", with the best gains in every run" for side, (best, _) in survey.best.items() if best is not None}
     shares = [
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()

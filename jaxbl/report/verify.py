@@ -71,7 +71,7 @@ def describe(verdict: Verdict) -> Result:
         headline = f"Not safe: {names}. A disturbance within f⁺ can keep the error from dying out."
     elif own_gains or marks:
         whose = "study's own" if own_gains else "marked"
-        headline = f"The {whose} gains are safe: any disturbance within f⁺ dies out in finite time."
+        headline = f"The {whose} gains are safe: whatever disturbs within f⁺, the error dies out in finite time."
         headline += f" Of those marked not safe: {'; '.join(unsafe)}." if unsafe else ""
     elif failures:
         word, headline = "doubtful", f"The observer failed in {failures} of {extent} although the exact gain condition held."

@@ -10,8 +10,8 @@ from jaxbl.report.gain_plane import condition_curves, conditions_line, draw_gain
 from jaxbl.report.panels import Band
 
 GAINS = {
-    "exact holds": (1.24, 2.84, 1.97, "the gains are safe. λ may fall to "),
-    "all hold": (12.0, 3.1, 1.5, "the gains are safe. λ may fall to "),
+    "exact holds": (1.24, 2.84, 1.97, "the exact condition holds. λ may fall to "),
+    "all hold": (12.0, 3.1, 1.5, "the exact condition holds. λ may fall to "),
     "none holds": (0.005, 1.8, 1.59, "λ = 0.005 √rad/s is too small: it has to exceed 1.21 (exact condition)."),
     "no lambda": (0.0, 1.8, 1.59, "λ = 0 √rad/s is too small: it has to exceed 1.21 (exact condition)."),
     "alpha too small": (4.0, 1.0, 1.5, "α = 1 rad/s² is too small, as it has to exceed f⁺."),

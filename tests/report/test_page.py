@@ -105,7 +105,7 @@ def test_page_of_a_sweep(tmp_path):
     found = write_report(result, tmp_path)
     assert (found.verdict, found.headline) == (
         "good",
-        "40 runs: the motor observer converges in 80.0 %, with the best gains in all.",
+        "40 runs: the motor observer converges in 80.0 %, with the best gains in every run.",
     )
     assert found.key_figures == [
         ("2.66 rad/s", "motor: velocity error of the best gains, rms (alpha = 2.66, lambda = 2.71)"),

@@ -138,7 +138,7 @@ def test_headline_counts_points_and_takes_shares_from_the_coarse_grid(seeds):
     simulated = len(result.frame) // seeds
     assert describe(result).headline == (
         f"{len(result.frame)} runs at {simulated} of 1089 grid points ({100 * simulated / 1089:.0f} %): the motor observer "
-        f"converges in {100 * coarse:.1f} % on the coarse grid, with the best gains in all."
+        f"converges in {100 * coarse:.1f} % on the coarse grid, with the best gains in every run."
     )
 
 

@@ -48,7 +48,9 @@ def test_page_and_lines(verify_report):
     assert result.key_figures[0] == (
         f"× {4.0 / least:.3g}", "the study's gains, motor: λ over the least that is safe (exact condition)"
     )  # fmt: skip
-    assert result.remarks[0].startswith(f"motor: f⁺ = {bound:.3g} rad/s² is the largest of all runs; the gains are safe.")
+    assert result.remarks[0].startswith(
+        f"motor: f⁺ = {bound:.3g} rad/s² is the largest of all runs; the exact condition holds."
+    )
     # smaller ones are not, which comes first
     data = verdict.config.to_dict()
     data["observer"]["motor"]["lambda"] = 0.5 * least

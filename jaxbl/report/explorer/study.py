@@ -68,9 +68,9 @@ def comparison_source(file: Path, _: str, sentences: Sequence[str]) -> Source:
         InputError: files are damaged or missing, or no point is common.
     """
     summary, folder = read_result(file), file.parent
+    config = read_config(check_result(folder / "study.toml"))
     if not summary["points"]["both"]:
         raise InputError(f"{folder}: no point is in both studies: there is nothing to show")
-    config = read_config(check_result(folder / "study.toml"))
     config = config.model_copy(update={"sweep": config.sweep.model_copy(update={"seeds": 1})})
     names = [Path(name).name for name in summary["names"]]
 
