@@ -165,9 +165,9 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()
     ]
-    if not shares:
-        return "; ".join([runs, *(f"{metric} goes from {ends}" for ends, metric in survey.list_ranges()[:1])]) + "."
-    return f"{runs}: {'; '.join(shares)}."
+    for ends, metric in survey.list_ranges()[:1]:
+        return f"The study does not ask what converges. In {runs}, {metric} goes from {ends}."
+    return f"{runs}: {'; '.join(shares)}." if shares else f"{runs}."
 
 
 def _explain_ends(law: Law) -> str:
