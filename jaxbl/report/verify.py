@@ -21,12 +21,13 @@ from .loop_gains import margin_table
 from .maps import cell_edges
 from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mark
 
-_USUAL = {"name": "usual pair (1.5, 1.1)", "alpha_ratio": 1.1, "lambda_ratio": 1.5}
+_USUAL = 1.1, 1.5, "usual pair (1.5, 1.1)"
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 
 
 def draw(verdict: Verdict) -> list[Figure]:
-    """The atlas with the usual pair and the study's marks; the runs of the drive are for `jaxbl explore`."""
+    """The atlas with the study's own gains, the usual pair and the study's marks; the runs of the drive are for
+    `jaxbl explore`."""
     plane = verdict.error_map
     scale = Scale(0.05, 20.0, "ratio ρ of successive velocity peaks, simulated", True, "PuOr_r")
     ranges = {"α / f⁺": plane.alpha, "λ / √f⁺": plane.lambda_}
@@ -34,10 +35,17 @@ def draw(verdict: Verdict) -> list[Figure]:
     curves = condition_curves(list_conditions(verdict.config), 1.0, (plane.alpha[0], plane.alpha[-1]))
     step = max(len(plane.alpha) // 24, 1)
     boundary = Line(plane.alpha[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
-    marks = [_USUAL, *(gains for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None)]
+    own_gains = _judge_own_gains(verdict).items()
+    places = [
+        *((gains["alpha"] / bound, gains["lambda"] / bound**0.5, f"the study's gains, {side}")
+          for side, gains in own_gains if (bound := gains["f_plus"]) > 0.0),
+        _USUAL,
+        *((gains["alpha_ratio"], gains["lambda_ratio"], gains["name"])
+          for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None),
+    ]  # fmt: skip
     marks = [
-        mark(gains["alpha_ratio"], gains["lambda_ratio"], literal(gains["name"]), marker, 12.0)
-        for gains, marker in zip(marks, itertools.cycle(("*", *MARKERS)), strict=False)
+        mark(alpha, lambda_, literal(name), marker, 12.0)
+        for (alpha, lambda_, name), marker in zip(places, itertools.cycle(("*", *MARKERS)), strict=False)
     ]
     parts = [Map(*edges, plane.ratio, scale), *curves, boundary, *marks]
     title = "Error system under its worst disturbance: below the boundary it grows"
