@@ -18,6 +18,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -249,7 +250,9 @@ class Trials:
         process = start(self.inputs, self.words(out))
         process.join(rng.uniform(0.02, 1.0) * self.seconds)
         if process.exitcode is None:
-            os.kill(process.pid, signal.SIGINT)
+            # it may end just now
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGINT)
         process.join(60.0)
         if process.exitcode is None:
             process.kill()
