@@ -34,8 +34,7 @@ NamedArrays = dict[str, np.ndarray]
 TracedArrays = dict[str, Array]
 """The same inside a traced function."""
 Number = Any  # a number of one lane: Float[Array, ""] inside a step
-Count = Int[Array, ""]
-"""Index of a sample or of a plant step, or a seed."""
+Integer = Int[Array, ""]  # an index of a sample or plant step, or a seed
 
 
 class Run(eqx.Module):
@@ -322,7 +321,7 @@ def begin_sample(
     period = run.sample_period / run.substeps
     effects, arriving_torque = plant.receive(state.effects, torque, run.sample_period)
 
-    def substep(i: Count, state: PlantState) -> PlantState:
+    def substep(i: Integer, state: PlantState) -> PlantState:
         return plant.advance(state, arriving_torque(i * period, period), time + i * period, period)
 
     return PlantState(state.position, state.velocity, effects), substep
@@ -348,7 +347,7 @@ class Reducer(NamedTuple):
     """
 
     init: Callable[[Experiment], Any]
-    update: Callable[[Experiment, Any, Count, Signals], Any]
+    update: Callable[[Experiment, Any, Integer, Signals], Any]
     result: Callable[[Experiment, Any, State], TracedArrays]
     done: Callable[[Experiment, Any, State], Array] | None = None
 
@@ -356,7 +355,7 @@ class Reducer(NamedTuple):
 Reducers = tuple[Reducer, ...]
 
 
-def unit_noise(seed: Count, indices: Int[Array, " samples"], sides: tuple[str, ...]) -> TracedArrays:
+def unit_noise(seed: Integer, indices: Int[Array, " samples"], sides: tuple[str, ...]) -> TracedArrays:
     """Draw standard normal noise for each side, shape (samples,), which depends on seed and sample index alone.
 
     Runs with the same seed have common random numbers. The draws are float32 in all runs, so that both precisions see the
@@ -386,7 +385,7 @@ def initial_carry(experiment: Experiment, reducers: Reducers, state: State | Non
 
 
 def advance_sample(
-    experiment: Experiment, reducers: Reducers, carry: Carry, index: Count, *sample_inputs: Any
+    experiment: Experiment, reducers: Reducers, carry: Carry, index: Integer, *sample_inputs: Any
 ) -> tuple[Carry, Signals]:
     """Advance the carry by sample `index`, and return the signals there.
 
@@ -429,7 +428,7 @@ def all_done(experiment: Experiment, reducers: Reducers, carry: Carry) -> Array 
 
 def scan(
     experiment: Experiment,
-    seed: Count,
+    seed: Integer,
     reducers: Reducers = (),
     record: Callable[[State, Signals], Any] | None = None,
     stride: int = 1,

@@ -20,8 +20,8 @@ from size import ROOT, Size, measure_file, measure_folders
 # `records` say first what a proposed model leaves open. `.` holds the first half of a sample's plant steps (`begin_sample`),
 # which derivatives share, and `cli` proposes no comparison where no point is common: 34 and 17 tokens.
 CEILINGS = {
-    "all": (386892, 0.02, 0.2, 0.0),
-    "report": (44385, 0.04, 0.56, 0.0),
+    "all": (386899, 0.02, 0.2, 0.0),
+    "report": (44392, 0.04, 0.56, 0.0),
     "diagnosis": (57842, 0.0, 0.0, 0.0),
     "records": (51367, 0.0, 0.0, 0.0),
     "gains": (38229, 0.0, 0.0, 0.0),

@@ -80,7 +80,8 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     elif summary.get("numbers_off"):
         numbers = read_quantities(summary["parameters"])
         changes = {path: abs(np.log(number.factor)) for path, number in numbers.items() if number.factor > 0.0}
-        for path in sorted(changes, key=lambda path: -changes[path])[:1]:
+        if changes:
+            path = max(changes, key=lambda path: changes[path])
             figures.append(KeyFigure(str(numbers[path]), f"{path}, {numbers[path].nominal:g} in the model: furthest off"))
     return figures
 

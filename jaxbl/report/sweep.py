@@ -69,9 +69,12 @@ def answer_sweep(result: StudyResult) -> Result:
     works = works and all(best is not None for best, _ in survey.best.values())
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
-    verdict = "failed" if finished and not works else "good" if finished and not partly else "doubtful"
-    # what nothing is asked of is neither good nor bad
-    verdict = "no answer" if survey.ranges and verdict == "good" else verdict
+    verdict = "doubtful" if not finished or partly else "good"
+    if finished and not works:
+        verdict = "failed"
+    elif verdict == "good" and not survey.converged:
+        # of what no convergence is asked nothing is good or bad
+        verdict = "no answer"
     figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
     # the headline has the first
     figures += survey.list_ranges()[1:]
@@ -146,6 +149,9 @@ class _Survey:
         """From where to where metrics go, and in how many runs they are 0."""
         figures = []
         for column, (low, high, zeros) in self.ranges.items():
+            if low > high:
+                # no run has a number
+                continue
             none = f" (0 in {percent(zeros / self.runs)} of the runs)" if zeros else ""
             figures.append(KeyFigure(f"{low:.3g} to {high:.3g} {find_metric(column).unit}{none}", value_words(column)))
         return figures
@@ -165,9 +171,10 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()
     ]
-    for ends, metric in survey.list_ranges()[:1]:
-        return f"The study does not ask what converges. In {runs}, {metric} goes from {ends}."
-    return f"{runs}: {'; '.join(shares)}." if shares else f"{runs}."
+    if shares:
+        return f"{runs}: {'; '.join(shares)}."
+    extents = [f"{metric} goes from {ends}" for ends, metric in survey.list_ranges()] or ["no figure has a number"]
+    return f"The study does not ask what converges. In {runs}, {extents[0]}."
 
 
 def _explain_ends(law: Law) -> str:

@@ -3,6 +3,7 @@
 import inspect
 from typing import Any
 
+import numpy as np
 import pytest
 from small_study import ALPHA, LAMBDA, make_result, rigid_study, spaced_axis
 
@@ -41,6 +42,10 @@ def test_a_sweep_that_asks_for_other_metrics_says_where_they_go(study, tmp_path)
     assert result.verdict == "no answer" and " In 20 runs, motor: " in result.headline and " goes from " in result.headline
     (error,) = result.key_figures
     assert error.meaning == "motor: velocity error, rms" and error.value.endswith(" rad/s") and " to " in error.value
+    study = rigid_study({"sweep.metrics": ["chatter", "velocity_rmse"]}, **tables)
+    empty = dict.fromkeys(("motor__chatter", "motor__velocity_rmse"), lambda frame: np.nan)
+    nothing = jaxbl.describe(make_result(study, finite=lambda frame: False, **empty))
+    assert nothing.verdict == "failed" and nothing.headline.endswith(" In 20 runs, no figure has a number.")
 
 
 def test_each_kind_of_result_goes_to_its_own_functions():
