@@ -45,7 +45,7 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
         return steps
     gains = {f"observer.{side}.{gain}" for side in study.sides for gain in ("lambda", "alpha")}
     # where no gains work, none can be chosen
-    if gains & {*study.axis_paths} and card.verdict == "good":
+    if gains & {*study.axis_paths} and card.verdict != "failed":
         question = "Which gains have the least error, and are they better than the usual rule?"
         steps.append(_propose(question, "tune", file, "--out", f"{folder}_gains"))
     question = "What happens over time? One run, with the numbers that the study itself has."

@@ -60,6 +60,16 @@ def gain_axes(bound: float, alphas: Pair, lambdas: Pair) -> tuple[Axis, Axis]:
     )
 
 
+_LEAST_RESERVE = 1.25
+"""Factor by which gains may change until they fail, below which the card says so: f⁺ of a machine is known to about this."""
+
+
+def say_thin_reserve(reserves: Mapping[str, float]) -> str:
+    """Name the sides whose gains may change by too small a factor; "" if none are."""
+    thin = [f"{side} × {reserve:.3g}" for side, reserve in reserves.items() if reserve < _LEAST_RESERVE]
+    return f"Little reserve until they fail or err twice as much: {', '.join(thin)}." if thin else ""
+
+
 _GAINS = "lambda", "alpha", "f_plus", "largest_f_plus"
 
 

@@ -80,7 +80,7 @@ def draw(result: StudyResult) -> list[Figure]:
 def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     """The rows that a figure shows, with the columns that it needs; of a quasi-random design at the middles of bins."""
     config = result.config
-    names = "finite", "converged", "f_plus", "margin_alpha"
+    names = "finite", "converged", "f_plus", *MARGINS
     metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
     columns = [*config.axis_paths, "seed", *metrics]
     drawn = [axis for axis in config.axes if axis.path in (figure.x, figure.y)]
@@ -319,11 +319,13 @@ def drawn_values(part: DataFrame, value: str) -> Series:
     return values.where(part["finite"].astype(bool)).replace([np.inf, -np.inf], np.nan)
 
 
+MARGINS = "margin_alpha", "margin_exact"
+
+
 def worst_runs(groups: Groups, value: str) -> DataFrame:
-    """The worst run of each group: its `error`, the least `margin_alpha` of observers that have one, the share that
+    """The worst run of each group: its `error`, the least of each of `MARGINS` that the observers have, the share that
     `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
     side, column = value.partition(".")[0], partial(drawn_values, value=value)
-    margin = f"{side}.margin_alpha"
     columns: dict[str, Column] = {"mean": column, "square": lambda frame: column(frame) ** 2}
     means = groups.means(columns | {"converged": itemgetter(f"{side}.converged")})
     scatter = 0.0
@@ -331,18 +333,23 @@ def worst_runs(groups: Groups, value: str) -> DataFrame:
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
         scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
-    if margin in groups.columns:
-        means["margin_alpha"] = groups.spread(itemgetter(margin))["least"]
+    for margin in MARGINS:
+        if f"{side}.{margin}" in groups.columns:
+            means[margin] = groups.spread(itemgetter(f"{side}.{margin}"))["least"]
     return means.assign(error=groups.spread(column)["largest"], scatter=scatter)
 
 
 def best_gains(runs: DataFrame) -> BestGains | None:
-    """The best gains (:func:`jaxbl.gains.best_gains.find_best_gains`) of :func:`worst_runs` over them."""
+    """The best gains (:func:`jaxbl.gains.best_gains.find_best_gains`) of :func:`worst_runs` over them, of those that also
+    converge at every other input with this f⁺: by the exact condition."""
+    margins = {name: runs[name].to_numpy() for name in MARGINS if name in runs}
+    works = (runs["converged"] == 1.0).to_numpy()
     return find_best_gains(
         runs.index.to_frame(index=False).rename(columns=lambda path: path.rpartition(".")[2]),
         runs["error"].to_numpy(),
-        (runs["converged"] == 1.0).to_numpy(),
-        alpha_ratio=runs["margin_alpha"].to_numpy() if "margin_alpha" in runs else None,
+        works,
+        allowed=works & (margins.get("margin_exact", np.inf) > 1.0),
+        alpha_ratio=margins.get("margin_alpha"),
         scatter=runs["scatter"].to_numpy(),
     )
 

@@ -24,6 +24,7 @@ def write(trial: Trial, folder: Path) -> str:
 def describe(trial: Trial) -> Result:
     """Say whether the observers converged, and how large their errors are."""
     summary, metrics, limits = trial.summary, trial.summary["metrics"], trial.config.run
+    judged = summary["conditions"]
     sides, drive = trial.config.sides, trial.config.drive.build()
     failed = [side for side in sides if not metrics[f"{side}.converged"]]
     verdict, headline = "failed", "The run diverges: a number overflows."
@@ -33,6 +34,10 @@ def describe(trial: Trial) -> Result:
     elif metrics["finite"]:
         times = ", ".join(f"{metrics[f'{side}.convergence_time']:.3g} s ({side})" for side in sides)
         verdict, headline = "good", f"Converged: the errors stay within their tolerances after {times}."
+        if unsafe := [side for side, gains in judged.items() if gains["f_plus"] > 0.0 and not gains["holds"]["exact"]]:
+            who = f"the {' and '.join(unsafe)} observer{'s' * (len(unsafe) > 1)}"
+            verdict = "doubtful"
+            headline = f"{headline} By the exact condition, the gains of {who} do not ensure that at another start or input."
     quantities = [*itertools.product(sides, ("velocity", "torque"))]
     if trial.config.controller is not None:
         quantities += [(trial.config.controller.side, "following")]
@@ -51,8 +56,7 @@ def describe(trial: Trial) -> Result:
     if identified := summary["identified"]:
         rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
         tables.insert(0, ResultTable("Identified", ["", "true", *sides], rows))
-    judged = summary["conditions"].items()
-    remarks = [conditions_line(side, gains, "the true bound along this run") for side, gains in judged]
+    remarks = [conditions_line(side, gains, "the true bound along this run") for side, gains in judged.items()]
     title = trial.config.title or "Run"
     return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
 

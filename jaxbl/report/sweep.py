@@ -7,6 +7,8 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+from pandas.api.types import is_numeric_dtype
+
 from jaxbl.config import is_boolean
 from jaxbl.files import write_json
 from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
@@ -20,7 +22,8 @@ from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Groups, Rows
 from .checks import values_of
-from .maps import best_gains, draw as draw, laws_of, slope_text, value_words, worst_runs
+from .gain_plane import say_thin_reserve
+from .maps import MARGINS, best_gains, draw as draw, laws_of, slope_text, value_words, with_value, worst_runs
 
 
 def write(result: StudyResult, folder: Path) -> str:
@@ -52,7 +55,7 @@ def answer_sweep(result: StudyResult) -> Result:
         remarks.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
     for side, (best, runs) in survey.best.items():
         if best is None:
-            remarks.append(f"{side}: no gains converged in all runs with α above f⁺.")
+            remarks.append(f"{side}: no gains converged in all runs and fulfil the exact condition.")
             continue
         remarks += [
             f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
@@ -66,10 +69,11 @@ def answer_sweep(result: StudyResult) -> Result:
             KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}"),
         ]
     works = survey.diverged < survey.runs and all(survey.converged.values())
-    works = works and all(best is not None for best, _ in survey.best.values())
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
-    verdict = "doubtful" if not finished or partly else "good"
+    partly |= any(best is None for best, _ in survey.best.values())
+    thin = say_thin_reserve({side: best.margin for side, (best, _) in survey.best.items() if best is not None})
+    verdict = "doubtful" if not finished or partly or thin else "good"
     if finished and not works:
         verdict = "failed"
     elif verdict == "good" and not survey.converged:
@@ -86,7 +90,8 @@ def answer_sweep(result: StudyResult) -> Result:
         )
         for side, ranked in survey.importance.items()
     ]
-    return Result(config.title or "Study", verdict, _headline(result, survey), figures, remarks, config.notes, tables)
+    headline = " ".join(filter(None, (_headline(result, survey), thin)))
+    return Result(config.title or "Study", verdict, headline, figures, remarks, config.notes, tables)
 
 
 def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
@@ -100,12 +105,17 @@ def _share(share: tuple[float, float] | None) -> str:
     return "–" if share is None else f"{100 * share[0]:.0f} ± {100 * share[1]:.0f} %"
 
 
+_PARTED = 0.8
+"""Difference of two shares of converged runs above which the value between them is said: an edge in place of a slope."""
+
+
 class _Survey:
     """The numbers behind the sentences and the table of axes, found in one reading.
 
     Attributes:
         runs: their number; `even` those on points that are always simulated; `diverged`.
         converged: how many of the even ones converged, by side; none where the study does not say.
+        by_value: the even runs and those that converged at each value of an axis of a grid, by side and path.
         best: the best gains, by side, and the worst runs with each pair of gains; none where the study does not say.
         importance: axes by what they explain of the velocity error, by side; of random designs alone.
         ranges: where the study does not say what converged: least and largest number of each metric that its figures show,
@@ -115,13 +125,14 @@ class _Survey:
     def __init__(self, result: StudyResult):
         config = result.config
         paths = config.axis_paths
-        names = "converged", "velocity_rmse", "margin_alpha"
+        names = "converged", "velocity_rmse", *MARGINS
         metrics = [column for column in result.columns if column.rpartition(".")[2] in names]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(config)
+        varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
         self.runs = self.even = self.diverged = 0
         self.converged = {side: 0 for side in config.sides if f"{side}.converged" in metrics}
-        self.best, self.importance = {}, {}
+        self.best, self.importance, self.by_value = {}, {}, {}
         drawn = [] if self.converged else [figure.value for figure in config.figures if not is_boolean(figure.value)]
         self.ranges = {column: (math.inf, -math.inf, 0) for column in drawn if column in result.columns}
         for frame in result.batches([*paths, "seed", "finite", *metrics, *self.ranges]):
@@ -131,10 +142,12 @@ class _Survey:
             self.diverged += (~frame["finite"].astype(bool)).sum()
             for side in self.converged:
                 self.converged[side] += even[f"{side}.converged"].sum()
+                for path in varied:
+                    counts = even.groupby(path)[f"{side}.converged"].agg(["size", "sum"])
+                    self.by_value[side, path] = counts.add(self.by_value.get((side, path), 0.0), fill_value=0.0)
             for column, (low, high, zeros) in self.ranges.items():
                 values = frame[column].abs() if is_magnitude(column) else frame[column]
                 self.ranges[column] = min(low, values.min()), max(high, values.max()), zeros + (values == 0.0).sum()
-        varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
         for side in config.sides:
             error, gains = f"{side}.velocity_rmse", [path for path in varied if path.startswith(f"observer.{side}.")]
             if error in metrics and (ranked := rank_axes(result, error)):
@@ -144,6 +157,18 @@ class _Survey:
                 groups = Groups(Rows(result, columns), gains, paths)
                 runs = worst_runs(groups, error)
                 self.best[side] = best_gains(runs), runs
+
+    def find_edge(self, side: str) -> tuple[str, float, float, float] | None:
+        """The axis, and the value up to which and beyond which a side converges in the most different shares of runs, with
+        both shares; None where no axis parts them by `_PARTED`."""
+        edges = []
+        for (judged, path), counts in self.by_value.items():
+            if judged == side and is_numeric_dtype(counts.index):
+                below = counts.cumsum()[:-1]
+                above = counts.sum() - below
+                shares = zip(below.index, below["sum"] / below["size"], above["sum"] / above["size"], strict=True)
+                edges += [(path, *split) for split in shares if abs(split[1] - split[2]) >= _PARTED]
+        return max(edges, key=lambda edge: abs(edge[2] - edge[3]), default=None)
 
     def list_ranges(self) -> list[KeyFigure]:
         """From where to where metrics go, and in how many runs they are 0."""
@@ -167,6 +192,11 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         among = " on the coarse grid"
     even = survey.even or math.nan
     works = {side: ", with the best gains in every run" for side, (best, _) in survey.best.items() if best is not None}
+    for side in survey.converged.keys() - survey.best.keys():
+        if edge := survey.find_edge(side):
+            path, value, below, above = edge
+            place = with_value(result.config, path, float(f"{value:.3g}"))
+            works[side] = f" ({percent(below)} up to {place}, {percent(above)} beyond)"
     shares = [
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()

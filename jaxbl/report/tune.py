@@ -15,10 +15,10 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .certificate import certificate_lines, certificate_tables, is_refuted, write_certificates
-from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, usual_rule_curve
+from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, say_thin_reserve, usual_rule_curve
 from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
-from .panels import MARKERS, Figure, Map, Panel, literal, mark, with_unit
+from .panels import MARKERS, Figure, Line, Map, Panel, literal, mark, with_unit
 
 
 def draw(tuning: Tuning) -> list[Figure]:
@@ -35,14 +35,19 @@ def error_label(summary: JsonObject) -> str:
 def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
-    coarse = tuning.candidates[side].query("stage == 0").astype({"feasible": float})
-    error, feasible = (coarse.pivot_table(name, "lambda", "alpha", dropna=False) for name in ("error", "feasible"))
-    grid, failed = error.to_numpy(float), ~(feasible.to_numpy() >= 0.5)
+    coarse = tuning.candidates[side].query("stage == 0")
+    names = "error", "converged", "convergence_time"
+    error, converged, time = (coarse.pivot(index="lambda", columns="alpha", values=name) for name in names)
+    longest = np.inf if (table := tuning.config.tune) is None else table.longest_convergence or np.inf
+    grid, failed = error.to_numpy(float), ~(converged.to_numpy(bool) & (time.to_numpy(float) <= longest))
     values = np.where(failed, np.nan, grid)
     x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
     alphas, lambdas = ((edges[0], edges[-1]) for edges in (x, y))
-    cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "constraints not met, or diverged")
-    parts = [cells, *condition_curves(EXACT, bound, alphas), usual_rule_curve(bound, alphas)]
+    cells = Map(x, y, grid, colour_scale(values, label, "log"), failed, "not converged in time")
+    curves, asked = condition_curves(EXACT, bound, alphas), summary["margins"]
+    x_asked = np.maximum([alphas[0], *curves[-1].x], asked["alpha"] * bound)
+    margins = Line(x_asked, [lambdas[1], *(asked["exact"] * curves[-1].y)], "", "#FFFFFF", 2.0, ":")
+    parts = [cells, *curves, margins, usual_rule_curve(bound, alphas)]
     # on the study's own excitation
     compared = [row for row in summary["named"] if row["side"] == side and row["name"] != "tuned"]
     for row, marker in zip(compared, cycle(MARKERS), strict=False):
@@ -51,11 +56,11 @@ def _map(tuning: Tuning, side: str) -> Figure:
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     if flat := flat_remark(values):
         title = f"{title}\n{flat}"
-    remark = f" The edge of what meets them is that of {' and '.join(limits['binding'])}." if limits["binding"] else ""
+    remark = f" What forbids a smaller error: {' and '.join(limits['binding'])}." if limits["binding"] else ""
     caption = (
         f"{side}: {label} over all runs, on the coarse map; above and on the right the axes of the atlas "
-        f"(jaxbl verify). Grey: not converged, or a margin not met.{remark} Curves: the exact gain condition at "
-        "the f⁺ of the pilot run, and the usual rule's gains for it and larger ones. The other gains are compared below."
+        f"(jaxbl verify).{remark} Curves: the exact gain condition at the f⁺ of the pilot run, dotted with the margins "
+        "asked for; the usual rule's gains for this f⁺ and larger ones. The other gains are compared below."
     )
     panel = Panel(*gain_axes(bound, alphas, lambdas), parts, title)
     return Figure(f"tuning_{side}", [panel], caption, width=6.4, height=4.8)
@@ -118,8 +123,8 @@ def describe(tuning: Tuning) -> Result:
         verdict, headline = "doubtful", f"Better gains may lie beyond the range searched; of those in it take {chosen}."
     certified = certificate_lines(summary)
     reserves = {side: min(entry["margins"].values()) for side, entry in summary["verdict"].items()}
-    if thin := [f"{side} × {reserve:.3g}" for side, reserve in reserves.items() if reserve < _LEAST_RESERVE]:
-        verdict, headline = "doubtful", f"{headline} Little reserve until they fail or err twice as much: {', '.join(thin)}."
+    if thin := say_thin_reserve(reserves):
+        verdict, headline = "doubtful", f"{headline} {thin}"
     if beaten := _better_gains(summary):
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
     doubts = doubts_among(summary["remarks"])
@@ -138,10 +143,6 @@ def describe(tuning: Tuning) -> Result:
     ]
     title = tuning.config.title or "Gains"
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
-
-
-_LEAST_RESERVE = 1.25
-"""Factor by which gains may change until they fail, below which the card says so: f⁺ of a machine is known to about this."""
 
 
 def _better_gains(summary: JsonObject) -> list[str]:

@@ -50,6 +50,7 @@ def test_heatmap_has_each_value_in_its_cell_with_units_on_its_axes(tmp_path):
         small_study(axes=GAINS, figures=[heatmap_figure()]),
         motor__velocity_rmse=product_error,
         motor__margin_alpha=lambda frame: 2.0 * frame[ALPHA],
+        motor__margin_exact=lambda frame: 2.0,
     )
     (panel,) = drawing.panels
     cells, alphas, lambdas = find_map(panel), np.geomspace(1.0, 50.0, 5), np.geomspace(1.0, 20.0, 4)
@@ -109,6 +110,7 @@ def test_diverged_points_are_left_grey_and_counted(tmp_path, value):
 def test_what_did_not_converge_is_grey_and_sets_no_colour(tmp_path):
     data = small_study(axes=GAINS, figures=[heatmap_figure()])
     columns = {"motor__velocity_rmse": product_error, "motor__margin_alpha": lambda frame: frame[ALPHA]}
+    columns["motor__margin_exact"] = lambda frame: 1.01
     whole = draw_only_figure(tmp_path, data, **columns)
     partly = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame[ALPHA] > 5.0, **columns)
     nothing = draw_only_figure(tmp_path, data, motor__converged=lambda frame: frame[ALPHA] < 0.0, **columns)
@@ -118,8 +120,10 @@ def test_what_did_not_converge_is_grey_and_sets_no_colour(tmp_path):
     cells = find_map(partly.panels[0])
     np.testing.assert_array_equal(cells.failed, np.broadcast_to(np.geomspace(1.0, 50.0, 5) < 5.0, (4, 5)))
     assert cells.scale.low == pytest.approx(cells.values[~cells.failed].min())
-    # the best is sought among those that converged
+    # the best is sought among those that converged, and by the exact condition do so at other inputs
     assert "best ★ 7.1" in partly.panels[0].title
+    columns["motor__margin_exact"] = lambda frame: 0.3 * frame[LAMBDA]
+    assert "best ★ 20 rad/s" in draw_only_figure(tmp_path, data, **columns).panels[0].title
 
 
 def test_conditions_are_drawn_for_the_median_bound_of_the_panel(tmp_path):

@@ -101,6 +101,7 @@ def test_page_of_a_sweep(tmp_path):
         motor__velocity_rmse=lambda frame: frame[ALPHA],
         motor__converged=lambda frame: frame[ALPHA] > 2.0,
         motor__margin_alpha=lambda frame: frame[ALPHA],
+        motor__margin_exact=lambda frame: 2.0,
     )
     found = write_report(result, tmp_path)
     assert (found.verdict, found.headline) == (

@@ -77,9 +77,9 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning):
     (cells,) = parts_of(panel, Map)
     coarse = tuning.candidates["motor"].query("stage == 0").sort_values(["lambda", "alpha"])
     np.testing.assert_allclose(np.ravel(cells.values), coarse["error"])
-    np.testing.assert_array_equal(np.ravel(cells.failed), ~coarse["feasible"].to_numpy(bool))
+    np.testing.assert_array_equal(np.ravel(cells.failed), ~coarse["converged"].to_numpy(bool))
     # colours are for what works
-    works = coarse[coarse["feasible"].astype(bool)]["error"]
+    works = coarse[coarse["converged"].astype(bool)]["error"]
     assert cells.scale.low >= 0.5 * works.min() and cells.scale.high <= 1.5 * works.max()
     gains = tuning.summary["gains"]["motor"]
     star = part_named(panel, "tuned")
@@ -87,7 +87,7 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning):
     # in units of f⁺ above and on the right
     bound = tuning.summary["f_plus"]["motor"]
     assert [axis.ratio[0] for axis in (panel.x, panel.y)] == pytest.approx([bound, bound**0.5])
-    assert {"constraints not met, or diverged", "exact, ρ < 1", "usual rule", "config", "slow", "tuned"} <= {
+    assert {"not converged in time", "exact, ρ < 1", "usual rule", "config", "slow", "tuned"} <= {
         *names_of(panel)
     }
     # on the edge, not outside
@@ -115,7 +115,7 @@ def test_map_and_sentence_name_the_constraint_that_binds(tuning):
     for binding in ([], ["margin_exact"]):
         result = dataclasses.replace(tuning, summary=set_binding(tuning.summary, binding))
         drawings = {d.name: d for d in draw_tuning(result)}
-        assert ("The edge of what meets them is that of margin_exact." in drawings["tuning_motor"].caption) == bool(binding)
+        assert ("What forbids a smaller error: margin_exact." in drawings["tuning_motor"].caption) == bool(binding)
         forbidden = "motor: a smaller error is forbidden by margin_exact."
         assert (forbidden in describe(result).remarks) == bool(binding)
         (row,) = [row for row in describe(result).tables[0].rows if row[0].startswith("motor: λ")]

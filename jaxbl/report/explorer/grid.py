@@ -17,7 +17,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.gain_plane import least_lambdas
-from jaxbl.report.maps import axis_words, best_gains, worst_runs
+from jaxbl.report.maps import MARGINS, axis_words, best_gains, worst_runs
 from jaxbl.report.panels import pack_numbers
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -141,7 +141,8 @@ def _stars(
     side = first.partition(".")[0]
     paths, values = zip(*(next(iter(dims[i].items())) for i in (y, x)), strict=True)
     shape = cells[first].shape
-    needed = [name for name in (first, f"{side}.converged", f"{side}.margin_alpha", "finite") if name in cells]
+    asked = (f"{side}.{name}" for name in ("converged", *MARGINS))
+    needed = [name for name in (first, "finite", *asked) if name in cells]
     gains = {f"observer.{side}.alpha", f"observer.{side}.lambda"}
     if {*paths} != gains or not {"finite", f"{side}.converged"} <= {*needed} or math.prod(shape[-3:]) > _MOST_STARRED:
         return []

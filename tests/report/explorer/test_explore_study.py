@@ -291,6 +291,7 @@ def test_the_first_view_is_the_slice_with_a_border_and_has_the_best_gains(tmp_pa
     columns = {
         "motor__converged": lambda frame: (frame[ALPHA] > 10.0) | (frame[NOISE] < 5e-5),
         "motor__margin_alpha": lambda frame: frame[ALPHA],
+        "motor__margin_exact": lambda frame: 2.0,
     }
     result = make_study_result(**columns)
     write_static(make_source(result), tmp_path)
