@@ -202,7 +202,7 @@ class EffectSearch:
         return (
             fitted.foretold is not None
             and are_possible(fitted.numbers, self.log.period)
-            and all(fitted.share(name) > LIMITS.least_torque for name in fitted.names)
+            and all(map(fitted.counts, fitted.names))
         )
 
     # ---- the loop ----

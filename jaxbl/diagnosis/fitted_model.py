@@ -6,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbl.chain import Experiment
-from jaxbl.drive.effects import EFFECTS, Numbers
+from jaxbl.drive.effects import EFFECTS, Numbers, make_effect
 from jaxbl.drive.parameters import get_leaf, leaf_paths, set_leaves
 from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.estimation.logs import arrays
 from jaxbl.fused import Arrays
 
 from .linearised_model import Linear
+from .thresholds import LIMITS
 
 LEAST_LEFT = 0.05
 """Share of a positive number that is left of it at least where it is moved."""
@@ -68,6 +69,14 @@ class FittedModel(NamedTuple):
     def share(self, name: str) -> float:
         """Torque of an effect along the log, rms over the driving torque's."""
         return self.linear.torque_share(get_leaf(self.experiment, f"effects.{name}"))
+
+    def counts(self, name: str) -> bool:
+        """Tell whether the torque of an effect is large enough to be named; of a finer law, what parts it from the plain one
+        has to be, too."""
+        effect, place = get_leaf(self.experiment, f"effects.{name}"), name.partition(".")[0]
+        laws = EFFECTS[name].special_cases.items()
+        plain = [make_effect(f"{place}.{kind}", **reduced(self.numbers[name])) for kind, reduced in laws]
+        return all(self.linear.torque_share(effect, *less) > LIMITS.least_torque for less in [(), *zip(plain)])
 
     @property
     def numbers(self) -> dict[str, Numbers]:

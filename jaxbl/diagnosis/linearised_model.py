@@ -562,9 +562,13 @@ class Linear:
         products = self.columns([all_of_the_input()], predictor.smoothness, predictor.deviation).products
         return float(np.sqrt(products[-1, -1]))
 
-    def torque_share(self, effect: AbstractEffect) -> float:
-        """Torque of an effect along the log, rms over the driving torque's."""
-        power = sum(self._power(Forces(signals.of([effect])), signals)[0] for signals in self.signals)
+    def torque_share(self, effect: AbstractEffect, *plain: AbstractEffect) -> float:
+        """Torque of an effect along the log, less that of a plain law of it, rms over the driving torque's."""
+        power = 0.0
+        for signals in self.signals:
+            torques, *others = signals.of([effect, *plain])
+            apart = {place: torque - sum(other.get(place, 0.0) for other in others) for place, torque in torques.items()}
+            power += self._power(Forces([apart]), signals)[0]
         return float(np.sqrt(power / self.count)) / self.drive
 
     def same(self, name: str) -> int | None:

@@ -77,8 +77,11 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     """
     cutoff = min(_CUTOFF, 0.1 / max(first.period, second.period))
     first_rows, rows = (_select_moving_rows(log, cutoff) for log in (first, second))
-    turns = sum(float(np.ptp(first.motor[segment])) for segment in first.segments) / (2.0 * np.pi)
-    if first_rows is None or rows is None or turns * _MAX_HARMONIC < _MIN_PERIODS:
+    if first_rows is None or rows is None:
+        return None
+    # the arc, however often it was gone over
+    turns = float(np.ptp(np.concatenate([first.motor[segment] for segment in first.segments]))) / (2.0 * np.pi)
+    if turns * _MAX_HARMONIC < _MIN_PERIODS:
         return None
     lowest = int(np.ceil(_MIN_PERIODS / turns))
     exchanged = _exchange_acceleration(first_rows), _exchange_acceleration(rows)
@@ -98,19 +101,21 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     if not varies[0]:
         return None
     varies = varies[1:]
-    motion = np.column_stack([first_rows.columns[:, varies], np.ones(len(first_rows.torque))])
-    waves, values = _find_waves(first_rows, motion, lowest_wave - 1)
+    # what does not repeat within the log, such as gravity over part of a turn, is no wave, and would be taken for one
+    motion, slow = first_rows.columns[:, varies], slice(lowest_wave - 1)
+    columns = np.column_stack([motion, _find_basis(first_rows.waves[:, slow])])
+    waves, values = _find_waves(first_rows, columns, lowest_wave - 1)
     if not waves:
         return None
-    cosine, sine = values[motion.shape[1] :].reshape(-1, 2).T
+    cosine, sine = values[columns.shape[1] :].reshape(-1, 2).T
     # torque a_n cos(n q) + b_n sin(n q) = Re((a_n - i b_n) exp(i n q))
     size, harmonics = cosine - 1j * sine, np.array(waves) + 1
     shifts = np.linspace(-np.pi, np.pi, 2 * (_SHIFTS_PER_PERIOD * int(harmonics.max()) // 2), endpoint=False)
     turns = np.exp(1j * harmonics[:, None] * shifts) * size[:, None]
-    # what the motion takes is known by the first log, but for constants
-    torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1] - 1]
+    # what the motion takes is known by the first log, but for constants and what depends on the zero
+    torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1]]
     signals = np.column_stack([torque, (rows.waves[:, waves] @ turns).real])
-    residuals = fit_residual(signals, np.column_stack([rows.columns[:, ~varies], np.ones(len(signals))]))
+    residuals = fit_residual(signals, np.column_stack([rows.columns[:, ~varies], _find_basis(rows.waves[:, slow])]))
     # without waves, and with those at each shift
     residuals[:, 1:] -= residuals[:, :1]
     block_squares = np.array([np.sum(part**2, axis=0) for part in np.array_split(residuals, BLOCKS)])
@@ -133,6 +138,12 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     if not abs(value) > _SURE_ERRORS * error:
         return None
     return ZeroShift(float(value), error, tuple(sorted(harmonics.tolist())))
+
+
+def _find_basis(waves: np.ndarray) -> np.ndarray:
+    """Return orthonormal columns that span a constant and some waves, as far as numbers tell these apart."""
+    columns, sizes, _ = np.linalg.svd(np.column_stack([np.ones(len(waves)), waves.real, waves.imag]), full_matrices=False)
+    return columns[:, sizes > 1e-6 * sizes[0]]
 
 
 def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[list[int], np.ndarray]:

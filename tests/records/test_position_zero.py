@@ -7,9 +7,9 @@ from jaxbl.records import TurningLog, find_zero_shift
 
 
 def simulate_turning_log(
-    seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns: float = 3.0
+    seed: int, zero: float, cogging: float = 2e-3, gear: bool = False, turns: float = 3.0, gravity: float = 0.0
 ) -> TurningLog:
-    """A motor that turns to and fro; cogging of 5 and 10 a turn, read from a zero of its own."""
+    """A motor that turns to and fro; cogging of 5 and 10 a turn, and gravity, read from a zero of its own."""
     random, period = np.random.default_rng(seed), 1e-3
     time = np.arange(8000) * period
     swing = 2.0 * np.pi * turns
@@ -22,6 +22,7 @@ def simulate_turning_log(
     # the shaft winds up by what is transmitted, and cogging is not
     load = read - 1e-2 * torque if gear else None
     torque += cogging * np.sin(10.0 * position + 0.4) + 0.5 * cogging * np.sin(5.0 * position)
+    torque += gravity * np.sin(position)
     torque += 1e-3 * random.standard_normal(len(time))
     return TurningLog(torque, read, load, [slice(0, 4000), slice(4000, 8000)], period)
 
@@ -91,6 +92,12 @@ def test_the_smallest_of_equal_places_is_taken():
 )
 def test_nothing_is_turned_without_need(first: TurningLog, second: TurningLog):
     assert find_zero_shift(first, second) is None
+
+
+@pytest.mark.parametrize("turns", [(0.25, 0.15), (0.4, 0.15), (0.25, 0.2)])
+def test_gravity_over_part_of_a_turn_is_no_wave(turns: tuple[float, float]):
+    logs = [simulate_turning_log(i, 0.0, cogging=0.0, turns=part, gravity=0.05) for i, part in enumerate(turns, 1)]
+    assert find_zero_shift(*logs) is None
 
 
 def test_a_log_that_stands_still_is_not_turned():
