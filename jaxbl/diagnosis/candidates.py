@@ -136,7 +136,7 @@ ZERO_SPREAD = 1.8
 """Prior standard deviation of an encoder's zero, rad: it may lie anywhere in a turn."""
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
-_REACH = 4.0 * SPACING
+REACH = 4.0 * SPACING
 """Change of that logarithm from which on another trial value would be nearer."""
 
 
@@ -210,7 +210,7 @@ def _trial(name: str, fixed: Numbers, from_rest: bool) -> Candidate:
 
     def numbers_of(values: Sequence[float]) -> Numbers | None:
         (change,) = values
-        return fixed | {leaf: value * math.exp(change)} if abs(change) < _REACH else None
+        return fixed | {leaf: value * math.exp(change)} if abs(change) < REACH else None
 
     return Candidate(name, 1, effects, columns, numbers_of, offset=True, from_rest=from_rest)
 

@@ -71,12 +71,13 @@ class FittedModel(NamedTuple):
         return self.linear.torque_share(get_leaf(self.experiment, f"effects.{name}"))
 
     def counts(self, name: str) -> bool:
-        """Tell whether the torque of an effect is large enough to be named; of a finer law, what parts it from the plain one
-        has to be, too."""
-        effect, place = get_leaf(self.experiment, f"effects.{name}"), name.partition(".")[0]
-        laws = EFFECTS[name].special_cases.items()
-        plain = [make_effect(f"{place}.{kind}", **reduced(self.numbers[name])) for kind, reduced in laws]
-        return all(self.linear.torque_share(effect, *less) > LIMITS.least_torque for less in [(), *zip(plain)])
+        """Tell whether the log shows an effect, and its torque is large enough to be named; of a finer law, what parts it
+        from the plain one has to be, too."""
+        effect, place, numbers = get_leaf(self.experiment, f"effects.{name}"), name.partition(".")[0], self.numbers[name]
+        plain = [make_effect(f"{place}.{kind}", **to(numbers)) for kind, to in EFFECTS[name].special_cases.items()]
+        return self.linear.shows(name, numbers) and all(
+            self.linear.torque_share(effect, *less) > LIMITS.least_torque for less in [(), *zip(plain)]
+        )
 
     @property
     def numbers(self) -> dict[str, Numbers]:

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbl.chain import Experiment
-from jaxbl.drive.effects import EFFECTS, AbstractEffect, Scales
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, Scales
 from jaxbl.drive.effects.loads import TRIAL_ARC
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
@@ -40,7 +40,7 @@ from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.records.least_squares import rms
 from jaxbl.workers import map_in_threads
 
-from .candidates import SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
+from .candidates import REACH, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
 from .evidence import Products
 from .neutral_effects import bucket, find_corrected, lean, with_torques
 from .thresholds import LIMITS
@@ -561,6 +561,13 @@ class Linear:
         predictor = self.choose(())
         products = self.columns([all_of_the_input()], predictor.smoothness, predictor.deviation).products
         return float(np.sqrt(products[-1, -1]))
+
+    def shows(self, name: str, numbers: Numbers) -> bool:
+        """Tell whether the log can show an effect with these numbers: a gap wider than any twist, or contacts that bend over
+        more than the motion, is another effect."""
+        log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
+        shapes = {leaf: role for leaf, role in EFFECTS[name].roles().items() if role.kind == "shape"}
+        return all(numbers[leaf] <= np.exp(REACH) * max(role.trials(log)) for leaf, role in shapes.items())
 
     def torque_share(self, effect: AbstractEffect, *plain: AbstractEffect) -> float:
         """Torque of an effect along the log, less that of a plain law of it, rms over the driving torque's."""

@@ -122,7 +122,6 @@ def _contradiction_lines(summary: JsonObject) -> Lines:
 
 
 _AS_WELL = "predicts new data as well as noise and the stated uncertainties allow"
-_FURTHER_OFF = "The numbers are further off than stated"
 
 
 def _verdict(summary: JsonObject) -> tuple[str, str]:
@@ -132,8 +131,9 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
         return "no answer", "The logs contradict each other: one model cannot hold for all of them."
     if summary.get("numbers_off"):
         word, answer = _verdict(summary | {"numbers_off": 0})
-        with_fitted = f"no effect is needed. With fitted ones the model {_AS_WELL}."
-        return word, f"{_FURTHER_OFF}{f'; {with_fitted}' if verdict == 'no_discrepancy' else f'. {answer}'}"
+        if verdict == "no_discrepancy":
+            answer = f"No effect is needed: with fitted numbers the model {_AS_WELL}."
+        return word, f"{answer} The numbers are further off than stated."
     if verdict == "no_discrepancy":
         return "good", f"Nothing is missing: the model {_AS_WELL}."
     if verdict == "explained":
