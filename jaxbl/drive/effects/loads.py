@@ -17,9 +17,6 @@ TRIAL_ARC = 3.0 * np.pi
 """Part of a wave that the motion must cover for its harmonic to be tried, rad: over less it does not repeat."""
 MAX_DAMPING_RATIO = 0.95
 """Largest damping ratio that is simulated: the exact step is that of a swing, and from 1 on nothing swings."""
-_LARGEST_DAMPING = 0.5
-"""Damping ratio up to which a diagnosis names a flexible part: rubber couplings reach 0.16 (relative damping 2, DIN 740-2),
-and from 0.7 on there is no resonance. Where a fit ends above, another loss makes it: friction that bends, or slip."""
 
 
 def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
@@ -174,14 +171,10 @@ class Flexibility(SideEffect):
     special_cases: ClassVar = {"inertia": lambda numbers: {"inertia": numbers["inertia"]}}
     inertia: Scalar = size("kg m²", "inertia J behind the spring", minimum=0.0)
     frequency: Scalar = frequency("frequency f at which it swings while the side stands still")
-    # from a welded frame to a belt
+    # from a welded frame to a belt; rubber couplings reach 0.16 (relative damping 2, DIN 740-2)
     damping_ratio: Scalar = shape(
         "", "damping ratio D", lambda log: [0.02, 0.1], default=0.02, above=0.0, maximum=MAX_DAMPING_RATIO
     )
-
-    @classmethod
-    def possible(cls, numbers):
-        return super().possible(numbers) and numbers["damping_ratio"] < _LARGEST_DAMPING
 
     @property
     def _rates(self):
