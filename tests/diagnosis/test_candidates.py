@@ -1,8 +1,6 @@
 """Which effects are laws of the same torque, and which numbers they may have."""
 
-import pytest
-
-from jaxbl.diagnosis.candidates import are_possible, is_finer_law
+from jaxbl.diagnosis.candidates import is_finer_law
 from jaxbl.drive.effects import EFFECTS
 
 
@@ -16,9 +14,3 @@ def test_finer_laws_are_those_of_the_torque_of_their_special_case():
         "cogging_harmonics",
     }
     assert {kind for kind, finer in general.items() if not finer} == {"gravity", "periodic_disturbance", "flexibility"}
-
-
-@pytest.mark.parametrize(("damping", "possible"), [(0.02, True), (0.16, True), (0.6, False), (0.9, False)])
-def test_a_flexible_part_that_hardly_swings_is_none(damping, possible):
-    numbers = {"inertia": 0.01, "frequency": 5.0, "damping_ratio": damping}
-    assert are_possible({"load.flexibility": numbers}, 1e-3) == possible

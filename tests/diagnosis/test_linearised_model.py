@@ -265,3 +265,28 @@ def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(geared_model
         EFFECTS["transmission.eccentricity"].roles()["harmonic"].trials(geared_model.scales("transmission.eccentricity"))
     )
     assert tuple(trials) == (1.0, *(float(n) for n in range(max(least, 2), 9)), 10.0)
+
+
+@pytest.mark.parametrize(("damping", "shown"), [(0.02, True), (0.16, True), (0.6, False), (0.9, False)])
+def test_a_flexible_part_that_hardly_swings_is_none(geared_model, damping, shown):
+    numbers = {"inertia": 0.01, "frequency": 5.0, "damping_ratio": damping}
+    assert geared_model.shows("load.flexibility", numbers) == shown
+
+
+@pytest.mark.parametrize(("part", "shown"), [(1e-3, True), (0.2, True), (0.5, False)])
+def test_contacts_that_bend_over_the_motion_are_no_friction(geared_model, part, shown):
+    spread = geared_model.scales("motor.presliding_friction").spread
+    numbers = {"torque": 0.1, "length": part * spread, "breakaway_ratio": 1.0, "stribeck_velocity": 1.0, "damping": 0.0}
+    assert geared_model.shows("motor.presliding_friction", numbers) == shown
+
+
+def test_a_finer_law_adds_what_parts_it_from_the_plain_one(geared_model):
+    plain = make_effect("motor.coulomb_friction", torque=0.1)
+    speed = geared_model.scales(plain.name).speed
+    finer = [
+        make_effect("motor.stribeck_friction", torque=0.1, breakaway_torque=0.1 + more, stribeck_velocity=0.5 * speed)
+        for more in (0.0, 0.01, 0.02)
+    ]
+    none, little, more = (geared_model.torque_share(effect, plain) for effect in finer)
+    assert none < 1e-6 and more == pytest.approx(2.0 * little, rel=1e-6)
+    assert little < geared_model.torque_share(finer[1]) / 5.0
