@@ -65,13 +65,14 @@ class Groups:
     """
 
     def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], further: Sequence[str] = ()):
-        self._rows, self._keys = rows, list(keys)
+        keys = self._keys = list(keys)
+        self._rows = rows
         distinct, first = list[DataFrame](), {}
         self.varied, self.columns = set[str](), set[str]()
         for frame in rows:
             self.columns |= {*frame}
-            if self._keys:
-                distinct.append(frame[self._keys].drop_duplicates())
+            if keys:
+                distinct.append(frame[keys].drop_duplicates())
                 # seldom, as it goes through all that differ
                 if sum(map(len, distinct[1:])) > len(distinct[0]) + 10_000:
                     distinct = [pd.concat(distinct).drop_duplicates()]
@@ -80,8 +81,8 @@ class Groups:
                 if (column != first.setdefault(name, column[0])).any():
                     self.varied.add(name)
         self.index: pd.Index = pd.RangeIndex(1)
-        if self._keys:
-            self.index = pd.concat(distinct).drop_duplicates().sort_values(self._keys).set_index(self._keys).index
+        if keys:
+            self.index = pd.concat(distinct).drop_duplicates().sort_values(keys).set_index(keys).index
 
     def __len__(self) -> int:
         return len(self.index)
@@ -112,9 +113,7 @@ class Groups:
                 there = ~np.isnan(values)
                 np.add.at(total, groups[there], values[there])
                 np.add.at(count, groups[there], 1.0)
-        with np.errstate(invalid="ignore"):
-            means = dict(zip(columns, sums / counts, strict=True))
-        return DataFrame({"rows": rows, **means}, index=self.index)
+        return DataFrame(sums.T, self.index, [*columns]).div(counts.T).assign(rows=rows)
 
     def spread(self, column: Column) -> DataFrame:
         """The `least`, `median` and `largest` of a column's numbers by group, NaN left out; NaN where a group has none."""

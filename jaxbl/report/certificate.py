@@ -21,11 +21,9 @@ ASSUMPTIONS = (
 
 def write_certificates(summary: JsonObject, folder: Path) -> None:
     """Write `certificate.json` of the sides of which something is proven, if there is one."""
-    proven = _proven(summary)
-    if not proven:
-        return
-    data = {"title": summary["title"], "observer": "super_twisting", "assumptions": list(ASSUMPTIONS), "sides": proven}
-    write_json(folder / "certificate.json", data)
+    if proven := _proven(summary):
+        data = {"title": summary["title"], "observer": "super_twisting", "assumptions": ASSUMPTIONS, "sides": proven}
+        write_json(folder / "certificate.json", data)
 
 
 def _proven(summary: JsonObject) -> JsonObject:

@@ -77,7 +77,7 @@ def describe(comparison: Comparison) -> Result:
         gone = ", ".join(f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i])
         remarks.append(gone and f"A number in {study} alone: {gone}.")
     figures = [KeyFigure(_factor(change), f"{change.metric}: {_ways(change)}") for change in changed[:4]]
-    rows = [[key, _value(old), _value(new)] for key, (old, new) in comparison.config.items()]
+    rows = [[key, *map(_value, values)] for key, values in comparison.config.items()]
     tables = [ResultTable("What differs in the config", ["key", *names], rows)] * bool(rows)
     if changed:
         head = ["metric", "points", "better", "worse", "factor from first to second (99 %)"]
@@ -119,12 +119,9 @@ def _split(change: MetricChange) -> tuple[int, int]:
 def _factor(change: MetricChange) -> str:
     """The mean change with its interval: a factor, or a difference of the share of runs."""
     ends = [end for end in change.moved if not math.isnan(end)]
-    if is_boolean(change.metric):
-        value, *interval = (f"{100 * end:+.2f} %" for end in ends)
-    elif not math.isfinite(change.moved.value):
+    if not math.isfinite(change.moved.value):
         return "–"
-    else:
-        value, *interval = (f"× {end:.3g}" for end in ends)
+    value, *interval = (f"{100 * end:+.2f} %" if is_boolean(change.metric) else f"× {end:.3g}" for end in ends)
     return f"{value} ({' to '.join(interval)})" if interval else value
 
 
@@ -136,17 +133,17 @@ def _value(value: Any) -> str:
 
 def draw(comparison: Comparison) -> list[Figure]:
     """Mean and spread of the factor of each metric that changed and has one; nothing where there is none."""
-    changes = [change for change in comparison.metrics if change.count and not is_boolean(change.metric)]
     rows = {}
-    for change in sorted(changes, key=lambda change: not change.better):
+    for change in sorted(comparison.metrics, key=lambda change: not change.better):
+        if not change.count or is_boolean(change.metric):
+            continue
         factor = _divide(comparison.frame(change.metric), change.metric).replace([np.inf, 0.0], np.nan)
         if factor.gt(0.0).any():
             rows[value_label(change.metric)] = factor.quantile(0.05), change.moved.value, factor.quantile(0.95)
     if not rows:
         return []
-    names, factors = zip(*[*rows.items()][:_ROWS], strict=True)
-    ends = zip(*factors, strict=True)
-    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(range(len(names)), *ends, colour=BLUE)]
+    names, factors = [*rows][:_ROWS], np.array([*rows.values()][:_ROWS]).T
+    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(range(len(names)), *factors, colour=BLUE)]
     caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
     x = Axis("factor from the first study to the second", log=True)
     return [Figure("factors", [Panel(x, name_rows(names), parts)], caption, height=0.9 + 0.3 * len(names))]
@@ -155,5 +152,4 @@ def draw(comparison: Comparison) -> list[Figure]:
 def _divide(frame: pd.DataFrame, metric: str) -> Any:
     """The second number over the first; of what is true or false the second less the first."""
     first, second = frame["first"], frame["second"]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return second - first if is_boolean(metric) else second / first
+    return second - first if is_boolean(metric) else second / first

@@ -54,7 +54,7 @@ def describe(summary: JsonObject) -> Result:
         number_table("Parameters of the model", read_quantities(summary["parameters"])),
     ]
     title = summary["title"] or f"Diagnosis of {Path(summary['file']).name}"
-    details = [*_gap_lines(summary["gap"]), *_remarks(summary)]
+    details = [_held_out_sentence(summary["gap"]["holdout"]), *_remarks(summary)]
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), _reasons(summary), details, tables))
 
 
@@ -75,13 +75,15 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     if summary["findings"]:
         finding = min(summary["findings"], key=lambda finding: finding["confidence"])
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
-        figures.append(KeyFigure(str(number), f"{finding['effect']}: {leaf}"))
-        figures.append(KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"))
+        figures += [
+            KeyFigure(str(number), f"{finding['effect']}: {leaf}"),
+            KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"),
+        ]
     elif summary.get("numbers_off"):
         numbers = read_quantities(summary["parameters"])
         changes = {path: abs(np.log(number.factor)) for path, number in numbers.items() if number.factor > 0.0}
         if changes:
-            path = max(changes, key=lambda path: changes[path])
+            path = max(changes, key=changes.__getitem__)
             figures.append(KeyFigure(str(numbers[path]), f"{path}, {numbers[path].nominal:g} in the model: furthest off"))
     return figures
 
@@ -104,8 +106,15 @@ def _reasons(summary: JsonObject) -> Lines:
         if alternatives:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in alternatives)
             lines.append(f"Not ruled out by this log in place of {finding['effect']}: {names}.")
-    lines = [*_contradiction_lines(summary), *summary["warnings"], *doubts, *_record_lines(summary), *lines]
-    return [*lines, *_failed_checks(summary), *_table_lines(summary)]
+    return [
+        *_contradiction_lines(summary),
+        *summary["warnings"],
+        *doubts,
+        *_record_lines(summary),
+        *lines,
+        *_failed_checks(summary),
+        *_table_lines(summary),
+    ]
 
 
 def _contradiction_lines(summary: JsonObject) -> Lines:
@@ -127,6 +136,7 @@ _AS_WELL = "predicts new data as well as noise and the stated uncertainties allo
 def _verdict(summary: JsonObject) -> tuple[str, str]:
     """The verdict and the answer in one sentence."""
     names, verdict = _names(summary), summary["verdict"]
+    them = "it" if len(summary["findings"]) == 1 else "them"
     if summary["contradictions"]:
         return "no answer", "The logs contradict each other: one model cannot hold for all of them."
     if summary.get("numbers_off"):
@@ -137,7 +147,7 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
     if verdict == "no_discrepancy":
         return "good", f"Nothing is missing: the model {_AS_WELL}."
     if verdict == "explained":
-        return "good", f"The model lacks {names}; with {_them(summary)}, it {_AS_WELL}."
+        return "good", f"The model lacks {names}; with {them}, it {_AS_WELL}."
     if verdict == "not_tested":
         lead = f"By the log the model lacks {names}" if names else "The log shows nothing that the model lacks"
         return "doubtful", f"{lead}, but the held-out data cannot test that."
@@ -148,10 +158,7 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
             return "no answer", "A gap might explain what is missing, but this log does not show it."
         return "no answer", "Something is missing that none of the known effects explains."
     if test["worse"]:
-        return (
-            "failed",
-            f"By the log the model lacks {names}, but it predicts the held-out data worse with {_them(summary)}.",
-        )
+        return "failed", f"By the log the model lacks {names}, but it predicts the held-out data worse with {them}."
     quantity = "missing torque" if "backlash" not in summary else "motor's squared prediction error beyond noise"
     share = summary["explained_share"] or 0.0
     text = f"{100.0 * share:.{0 if share < 0.99 else 1}f} %" if share <= 0.999 else "more than 99.9 %"
@@ -159,10 +166,6 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
         f"The model lacks {names}, but that is not all: on held-out data {'none' if share < 0.005 else text} of the "
         f"{quantity} is explained."
     )
-
-
-def _them(summary: JsonObject) -> str:
-    return "it" if len(summary["findings"]) == 1 else "them"
 
 
 def _record_lines(summary: JsonObject) -> Lines:
@@ -182,11 +185,13 @@ def _what_to_record(summary: JsonObject) -> str:
         for name, torque in effects.items()
     ]
     lead = "Even a complete model may leave as much as moves there."
-    if torques:
+    if effects:
         lead = f"The held-out data would pass without it, too ({'; '.join(torques)})."
-    # it acts there, but less than a complete model may leave
-    if effects and all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
-        return f"{lead} Hold out a motion in which it is a larger part of the torque, or one that is read with less noise."
+        # it acts there, but less than a complete model may leave
+        if all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
+            return (
+                f"{lead} Hold out a motion in which it is a larger part of the torque, or one that is read with less noise."
+            )
     reached = ", ".join(
         f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
         f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
@@ -195,16 +200,13 @@ def _what_to_record(summary: JsonObject) -> str:
     return f"{lead} Hold out a log that reaches as far: {reached}."
 
 
-_OVER = {"position": "position", "turn": "position within a turn", "speed": "speed"}
-
-
 def _table_lines(summary: JsonObject) -> Lines:
     """Say what tables of torques without a name add."""
     if "torque_tables" not in summary:
         return []
     added = summary["torque_tables"]
     torques = [
-        f"{side} torque over {_join_words([_OVER[table['over']] for table in tables])}"
+        f"{side} torque over {_join_words([table['over'].replace('turn', 'position within a turn') for table in tables])}"
         for side, tables in added["tables"].items()
     ]
     than = "" if added["holdout_z"] > 0.0 else ", which predict held-out data no better"
@@ -261,14 +263,12 @@ def probability(value: float) -> str:
     return "> 0.999" if value > 0.999 else f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
 
 
-def _gap_lines(gap: JsonObject) -> Lines:
-    holdout = gap["holdout"]
+def _held_out_sentence(holdout: JsonObject) -> str:
     place = f"On the last part of the log ({holdout['from']:.4g} to {holdout['to']:.4g} s), held out"
     if holdout["separate"]:
         place = f"On {Path(holdout['file']).name}"
-    window = holdout["window"]
-    how = "one sample ahead" if not window else f"over windows of {window:.2g} s"
-    return [f"{place}, the motion is predicted {how}."]
+    how = f"over windows of {holdout['window']:.2g} s" if holdout["window"] else "one sample ahead"
+    return f"{place}, the motion is predicted {how}."
 
 
 def rms_text(value: float | None) -> str:
@@ -298,9 +298,8 @@ def _history_table(summary: JsonObject) -> ResultTable:
 
 def _errors_of_channels(gap: JsonObject) -> dict[str, list[Any]]:
     """Held-out error before and after, noise, and the limit of a complete model, of each channel, and of slow torques."""
-    expected = gap["expected"]
     errors = {
-        name: [before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], expected.get(name, {}).get("limit")]
+        name: [before, gap["holdout_rmse_after"][name], gap["noise_floor"][name], gap["expected"].get(name, {}).get("limit")]
         for name, before in gap["holdout_rmse_before"].items()
     }
     slow = gap.get("slow_torques", {}).items()
@@ -312,8 +311,7 @@ def _gap_table(gap: JsonObject) -> ResultTable:
     for name, numbers in _errors_of_channels(gap).items():
         channel, *below = name.split(maxsplit=1)
         rows.append([", ".join([_CHANNELS[channel], *below]), gap["units"][channel], *numbers])
-    head = ["channel", "unit", "before", "after", "noise", "complete model at most"]
-    return ResultTable("Held-out data, rms", head, rows)
+    return ResultTable("Held-out data, rms", ["channel", "unit", "before", "after", "noise", "complete model at most"], rows)
 
 
 def draw(diagnosis: Diagnosis) -> list[Figure]:
@@ -335,7 +333,7 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
             if held and not all(other for _, _, other in pieces):
                 parts.append(Span(before.time[0], before.time[-1], "held out", ORANGE, opacity=0.18))
             # behind the low-pass that the analysis used
-            (first, _), (last, _) = (narrow(residual, bandwidth) for residual in (before, after))
+            (first, _), (last, _) = narrow(before, bandwidth), narrow(after, bandwidth)
             parts += [
                 Line(first.time, first.torque, "before", VERMILION, 2.6, opacity=0.6),
                 Band(last.time, -2.0 * last.deviation, 2.0 * last.deviation, "± 2 noise", MISSING, 0.75),

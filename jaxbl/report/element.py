@@ -26,14 +26,14 @@ def describe(summary: JsonObject) -> Result:
     headline = (
         f"{' and '.join(summary['method']['element']['terms'])} explain the torque but for {_size(torque, torque['unit'])}."
     )
-    tables = [number_table("Numbers", numbers)]
     figures, remarks = number_figures(numbers), [*summary["warnings"], *_remarks(summary)]
-    return lead_with_doubt(Result(summary["title"], "good", headline, figures, remarks, summary["notes"], tables))
+    return lead_with_doubt(
+        Result(summary["title"], "good", headline, figures, remarks, summary["notes"], [number_table("Numbers", numbers)])
+    )
 
 
 def _remarks(summary: JsonObject) -> Lines:
-    element, torque = summary["method"]["element"], summary["torque"]["element"]
-    unit = torque["unit"]
+    element, unit = summary["method"]["element"], summary["torque"]["element"]["unit"]
     lines = [f"Not identifiable: {next(iter(refusal['direction']))}: {refusal['why']}." for refusal in summary["refused"]]
     for term, gain in element["gains"].items():
         lines.append(
@@ -55,9 +55,9 @@ def _size(error: JsonObject, unit: str) -> str:
 
 def draw(result: ElementIdentification) -> list[Figure]:
     """All figures of a transmission on a test rig."""
-    trace, record, numbers = result.trace, result.task.record, result.element.numbers
+    record, numbers = result.task.record, result.element.numbers
     unit, torque_unit = (record.statistics.channels[name].unit for name in ("theta_e", "u"))
-    time, x, u, fitted = (trace[name].to_numpy() for name in ("t", "displacement", "u", "torque"))
+    time, x, u, fitted = (result.trace[name] for name in ("t", "displacement", "u", "torque"))
     parts = [cloud(x, u, "measured"), cloud(x, fitted, "found", BLUE)]
     if {"half_gap", "centre"} <= numbers.keys():
         middle, half = numbers["centre"].value, numbers["half_gap"].value

@@ -50,8 +50,7 @@ def error_path(trace: DataFrame, side: str, judged: JsonObject) -> ErrorPath:
     least = judged["least_lambda"]["davila_fridman"]
     ratio = None if least is None or lambda_ == 0.0 else least / lambda_
     curve = (np.zeros(0), np.zeros(0)) if ratio is None or not len(peaks) else majorant(peaks[0], *gains)
-    reach = [_reach(*values) for values in zip(path, curve, strict=True)]
-    return ErrorPath(*path, peaks, ratio, curve, reach)
+    return ErrorPath(*path, peaks, ratio, curve, [*map(_reach, path, curve)])
 
 
 def _reach(error: Array, majorant: Array) -> float:
@@ -82,13 +81,13 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
     parts = [Line(error, slope, name, VERMILION, 1.2)]
     if len(curve[0]):
         parts.append(Line(*curve, f"majorant (36)-(37): ratio {ratio:.3g}", width=1.0))
-    labels = "position error e (rad)", "its slope ė (rad/s)"
-    x, y = (Axis(label, ends=(-reach, reach) if reach else None) for label, reach in zip(labels, reaches, strict=True))
+    x_ends, y_ends = ((-reach, reach) if reach else None for reach in reaches)
+    axes = Axis("position error e (rad)", ends=x_ends), Axis("its slope ė (rad/s)", ends=y_ends)
     reason = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
     return [
         Figure(
             f"error_plane_{side}",
-            [Panel(x, y, parts)],
+            [Panel(*axes, parts)],
             f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane (cf. "
             f"Fig. 29). The majorant of the proof is for the worst disturbance within f⁺ = {bound:.3g} rad/s², without "
             f"friction; a ratio below 1 proves convergence.{reason}",

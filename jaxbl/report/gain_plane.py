@@ -40,8 +40,7 @@ def condition_curves(conditions: Mapping[str, Condition], bound: float, alphas: 
             x, y = y, x
         dashes, colour = _LOOKS[name]
         # named where it is drawn; a dark line beneath parts it from any colour
-        beneath = Line(x, y, colour="#222222", width=3.4)
-        curves += beneath, Line(x, y, condition.title, colour, 2.0, dashes, at_line=True)
+        curves += Line(x, y, colour="#222222", width=3.4), Line(x, y, condition.title, colour, 2.0, dashes, at_line=True)
     return curves
 
 
@@ -101,8 +100,8 @@ def draw_gain_plane(side: str, judged: JsonObject) -> Figure:
     least = judged["least_lambda"]["exact"]
     # a gain of zero has no place on a logarithmic axis
     alphas = min(0.7 * bound, 0.5 * alpha or bound), max(20.0 * bound, 3.0 * alpha)
-    lowest, highest = 0.15 * np.sqrt(bound), 30.0 * np.sqrt(bound)
-    lambdas = min(0.3 * (lambda_ or lowest), 0.5 * (least or lowest), lowest), max(3.0 * lambda_, highest)
+    lowest = 0.15 * np.sqrt(bound)
+    lambdas = min(0.3 * (lambda_ or lowest), 0.5 * (least or lowest), lowest), max(3.0 * lambda_, 30.0 * np.sqrt(bound))
     _, exact = condition_curves(EXACT, bound, alphas)
     # α has to exceed f⁺, whatever λ is
     x, y = [alphas[0], exact.x[0], *exact.x], [lambdas[1], lambdas[1], *exact.y]

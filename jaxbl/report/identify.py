@@ -46,17 +46,15 @@ def describe(summary: JsonObject) -> Result:
     """Say whether the model explains the log, and which numbers it has, from an `identification.json`."""
     parameters = read_quantities(summary["parameters"])
     numbers = {path: number for path, number in parameters.items() if number.is_finite}
-    complete = all(is_complete for is_complete, _ in _describe_residuals(summary))
     size = "; ".join(f"{side}: {_size(residual)}" for side, residual in summary["residual"].items())
     verdict, headline = "good", f"The model explains the log: no more than noise is left of the positions ({size})."
     if not numbers:
         verdict, headline = "no answer", "This log identifies none of the model's numbers."
-    elif not complete:
+    elif not all(map(is_noise, summary["residual"].values())):
         verdict = "doubtful"
         headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
     heading = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
     profiles = {path: number.get("profile_interval") for path, number in summary["parameters"].items()}
-    tables = [number_table(heading, parameters, profiles)]
     remarks = [*summary["warnings"], *_far_off(parameters)]
     if lacks := (summary.get("rejected") or {}).get("lacks"):
         remarks.append(
@@ -66,7 +64,9 @@ def describe(summary: JsonObject) -> Result:
     remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
     title = summary["title"] or f"Identification from {Path(summary['file']).name}"
     figures = [*_backlash(summary), *number_figures(numbers)][:4]
-    return lead_with_doubt(Result(title, verdict, headline, figures, remarks, _remarks(summary), tables))
+    return lead_with_doubt(
+        Result(title, verdict, headline, figures, remarks, _remarks(summary), [number_table(heading, parameters, profiles)])
+    )
 
 
 _FAR = 10.0
@@ -110,7 +110,7 @@ def _remarks(summary: JsonObject) -> Lines:
         how = "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
     lines += [
         summary["held"] and f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.",
-        *(line for _, line in _describe_residuals(summary)),
+        *_describe_residuals(summary),
         how,
         not fit["converged"] and "The fit stopped before it reached its tolerance.",
         summary["torque"] and f"Torque error of the model, rms: {_shares(summary['torque'])}.",
@@ -128,14 +128,14 @@ def _remarks(summary: JsonObject) -> Lines:
     return [*filter(None, lines), *summary["notes"]]
 
 
-def _describe_residuals(summary: JsonObject) -> list[tuple[bool, str]]:
-    """For each side, whether no more than noise is left of its positions, and a sentence that says so."""
+def _describe_residuals(summary: JsonObject) -> Lines:
+    """For each side, whether no more than noise is left of its positions."""
     meanings = [
         "noise of the torque, or something that the model lacks" if "backlash" in summary else "the model is incomplete",
         "noise alone",
     ]
     return [
-        (complete := is_noise(residual), f"{side}: position residual {_size(residual)}: {meanings[complete]}.")
+        f"{side}: position residual {_size(residual)}: {meanings[is_noise(residual)]}."
         for side, residual in summary["residual"].items()
     ]
 
@@ -177,7 +177,7 @@ class LogSignals:
 
     Attributes:
         sides: that have an observer.
-        unit: of positions, by side.
+        unit: of the motor's position.
         settled: the rows without those at the beginning, in which the observers converge.
     """
 
@@ -185,7 +185,7 @@ class LogSignals:
         self.record = result.record
         self.trace = result.trace.iloc[longest_segment(self.record.segments)]
         self.sides = [side for side in SIDES if f"{side}.velocity" in self.trace]
-        self.unit = {side: self.record.unit_of(f"{side}.position", "rad") for side in self.sides}
+        self.unit = self.record.unit_of("motor.position", "rad")
         self.torque_unit = self.record.unit_of("motor.torque", "N m")
         experiment = result.model.build()
         self.plant, self.time_constant = experiment.plant, float(experiment.equivalent_control.time_constant)
@@ -276,13 +276,13 @@ def _hysteresis(log: LogSignals) -> Figure:
     torques = {f"by the {side} side": log.torque_by(side) for side in log.sides}
     if "transmitted" in log.trace:
         torques["measured"] = log.low_passed(log["transmitted"])
-    rate = log["motor.velocity"] - float(log.plant.drive.ratio("load")) * log["load.velocity"]
-    twist, rate = map(log.low_passed, (log["twist"], rate))
+    rate = log.low_passed(log["motor.velocity"] - float(log.plant.drive.ratio("load")) * log["load.velocity"])
+    twist = log.low_passed(log["twist"])
     across = limits(twist[log.settled])
-    x = Axis(f"twist θe − N₀ θs ({log.unit['motor']})", ends=across)
+    x = Axis(f"twist θe − N₀ θs ({log.unit})", ends=across)
     y = Axis(f"transmitted torque ({log.torque_unit})", ends=limits(*(torque[log.settled] for torque in torques.values())))
     panels, half = [], log.plant.half_gap
-    gap = shade_gap(half, f"fitted gap: half width {half:.4g} {log.unit['motor']}")
+    gap = shade_gap(half, f"fitted gap: half width {half:.4g} {log.unit}")
     for name, torque in torques.items():
         parts = [*gap, *_means(log, twist, torque, rate, "twist", across)]
         if across:
@@ -310,7 +310,7 @@ def _friction(log: LogSignals) -> Figure:
     parts = _means(log, velocity, estimate, np.gradient(velocity), "velocity", across)
     if "motor.effects" in log.trace:
         parts.append(Line(velocity[rows], log.low_passed(log["motor.effects"])[rows], "fitted effects", width=1.2))
-    x = Axis(f"velocity by the smoother ({log.unit['motor']}/s)", ends=across)
+    x = Axis(f"velocity by the smoother ({log.unit}/s)", ends=across)
     y = Axis(f"resisting {quantity} ({unit})", ends=limits(estimate[rows]))
     return Figure(
         "friction",
@@ -327,11 +327,14 @@ def draw_motor_alone(result: Any) -> Figure:
     unit, torque_unit = result.record.unit_of("motor.position", "rad"), result.record.unit_of("motor.torque", "N m")
     trace, gap = result.trace.iloc[len(result.trace) // 10 :], result.summary["backlash"]
     ratio = float(result.model.build().plant.drive.ratio("load"))
-    twist = (trace["theta_e"] - ratio * trace["load.modelled_position"]).to_numpy()
-    by_motor, law = trace["torque_by_motor"].to_numpy(), trace["torque"].to_numpy()
+    twist = trace["theta_e"] - ratio * trace["load.modelled_position"]
+    by_motor, law = trace["torque_by_motor"], trace["torque"]
     half = (gap and gap["half_gap"]) or 0.0
-    clouds = cloud(twist, by_motor, "by the motor's side", BLUE), cloud(twist, law, "model", BLACK)
-    parts = [*shade_gap(half, f"gap: half width {half:.4g} {unit}"), *clouds]
+    parts = [
+        *shade_gap(half, f"gap: half width {half:.4g} {unit}"),
+        cloud(twist, by_motor, "by the motor's side", BLUE),
+        cloud(twist, law, "model", BLACK),
+    ]
     x = Axis(f"twist θe − N₀ θs, the load's position by the model ({unit})", ends=limits(twist))
     return Figure(
         "hysteresis",

@@ -1,5 +1,6 @@
 """Figures, table and report of an inspected log."""
 
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def write(inspection: Inspection, folder: Path) -> str:
 def describe(inspection: Inspection) -> Result:
     """Say what the log can identify, and what is wrong with it."""
     record = inspection.record
-    judgements = [(judged.quantity, judged.answer, judged.reason) for judged in inspection.identifiability]
+    judgements = [*map(astuple, inspection.identifiability)]
     parts, verdict = [], "no answer"
     # the best answer last: it decides
     for answer, lead, word in _ANSWERS:
@@ -73,15 +74,15 @@ def draw(inspection: Inspection) -> list[Figure]:
     return [_channels(inspection.record), *([] if inspection.twist is None else [_twist(inspection)])]
 
 
-def _values(record: Record) -> dict[str, np.ndarray]:
-    positions = {POSITION_CHANNELS[side]: values for side, values in record.positions.items()}
-    values = {"u": record.torque, **positions, "transmitted": record.transmitted}
-    return {name: signal for name, signal in values.items() if signal is not None}
-
-
 def _channels(record: Record) -> Figure:
     side, channels = main_side(record), record.statistics.channels
-    signals = [(signal, _LOOKS[name][0], channels[name].unit, _LOOKS[name][1]) for name, signal in _values(record).items()]
+    positions = {POSITION_CHANNELS[side]: values for side, values in record.positions.items()}
+    values = {"u": record.torque, **positions, "transmitted": record.transmitted}
+    signals = [
+        (signal, _LOOKS[name][0], channels[name].unit, _LOOKS[name][1])
+        for name, signal in values.items()
+        if signal is not None
+    ]
     unit = f"{channels[POSITION_CHANNELS[side]].unit}/s"
     signals.append((compute_velocity(record, side), f"{side} velocity", unit, PURPLE))
     caption = f"The channels over time, and the velocity by differences of the low-passed {side} position."
@@ -93,8 +94,7 @@ def _twist(inspection: Inspection) -> Figure:
     assert twist is not None
     channels, gearing = record.statistics.channels, record.statistics.gearing
     over = [(record.positions["load"], f"load position θs ({channels['theta_s'].unit})")]
-    name = "u" if record.transmitted is None else "transmitted"
-    torque = _values(record).get(name)
+    name, torque = ("u", record.torque) if record.transmitted is None else ("transmitted", record.transmitted)
     if torque is not None and np.ptp(torque):
         over.insert(0, (torque, f"{_LOOKS[name][0]} ({channels[name].unit})"))
     rows = np.r_[*record.segments]

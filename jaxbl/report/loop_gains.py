@@ -15,7 +15,7 @@ from jaxbl.sweeps.metrics import find_metric
 
 from .maps import axis_label
 from .panels import BLUE, Axis, Figure, Panel, arrange, cloud, mark, with_unit
-from .tune import for_title, write_gains
+from .tune import for_title
 
 
 def draw(tuning: LoopTuning) -> list[Figure]:
@@ -34,14 +34,14 @@ def draw(tuning: LoopTuning) -> list[Figure]:
     return [Figure("loop_gains", panels, caption, columns, 3.6 * columns, 3.2)]
 
 
-def write(tuning: LoopTuning, folder: Path) -> str:
-    """Write `gains.toml`. Returns the study's TOML."""
+def write(tuning: LoopTuning, folder: Path) -> None:
+    """Write `gains.toml`."""
     summary = tuning.summary
     head = (
         f"# Gains of a loop chosen by 'jaxbl tune'{for_title(summary)}\n# Objective: {summary['objective_metric']}.\n"
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n'
     )
-    return write_gains(tuning, folder, head + tomli_w.dumps(set_keys({}, summary["gains"])))
+    (folder / "gains.toml").write_text(head + tomli_w.dumps(set_keys({}, summary["gains"])), encoding="utf-8")
 
 
 def describe(tuning: LoopTuning) -> Result:

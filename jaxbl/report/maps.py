@@ -24,7 +24,7 @@ from jaxbl.sweeps.metrics import find_metric, is_magnitude
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .aggregates import Column, Groups, Rows
+from .aggregates import Groups, Rows
 from .checks import MOST_PARTS, check_figures, has_words, values_of
 from .gain_plane import condition_curves
 from .panels import COLOURS, Array, Axis, Band, Figure, Line, Map, Panel, Scale, arrange, mark, with_unit
@@ -54,20 +54,19 @@ def draw(result: StudyResult) -> list[Figure]:
     Raises:
         InputError: a figure names an axis or a metric that the study does not have.
     """
-    config = result.config
+    config, points, figures = result.config, Points(result.config), []
     specs = config.figures or default_figures(config, result.columns)
     check_figures(config, specs, result.columns)
-    points = Points(config)
-    figures = []
     runs = sum(map(len, result.batches(["seed"]))) if specs else 0
     unfinished = "" if result.is_finished(runs) else f" The study is not finished: {runs} runs so far, white where none is."
     for i, spec in enumerate(specs):
+        rows = _rows(result, spec, points)
         if spec.theory is not None:
             panels, caption = _laws(config, spec, [law for law in laws_of(result) if law.figure == i])
         elif spec.kind == "heatmap":
-            panels, caption = _heatmap(config, _rows(result, spec, points), spec, points)
+            panels, caption = _heatmap(config, rows, spec, points)
         else:
-            panels, caption = _lines(config, _rows(result, spec, points), spec)
+            panels, caption = _lines(config, rows, spec)
         caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}{unfinished}"
         name = re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{spec.value}").strip("_")
         same = sum(earlier.name.partition("-")[0] == name for earlier in figures)
@@ -82,7 +81,6 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     config = result.config
     names = "finite", "converged", "f_plus", *MARGINS
     metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
-    columns = [*config.axis_paths, "seed", *metrics]
     drawn = [axis for axis in config.axes if axis.path in (figure.x, figure.y)]
     random = [axis for axis in drawn if axis.values is None and axis.num is None]
     # about four points in each bin of a map
@@ -99,7 +97,7 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
             frame = frame.assign(**{axis.path: middles[np.searchsorted(edges, frame[axis.path])]})
         return frame
 
-    return Rows(result, columns, select)
+    return Rows(result, [*config.axis_paths, "seed", *metrics], select)
 
 
 _WORDS = {
@@ -138,8 +136,7 @@ def axis_of(config: Config, path: str, values: Array, log: bool | None = None) -
 
 def axis_words(config: Config, path: str) -> dict[str, str]:
     """Path, label and unit of an axis, for a page."""
-    label = path if path == "seed" else axis_label(config, path)
-    return {"path": path, "label": label, "unit": unit_of(config, path)}
+    return {"path": path, "label": axis_label(config, path), "unit": unit_of(config, path)}
 
 
 def unit_of(config: Config, path: str) -> str:
@@ -188,8 +185,9 @@ def _over(config: Config, varied: set[str], spec: FigureTable) -> str:
 def flat_remark(values: Array) -> str:
     """Return what a map says whose values differ by too little to count; "" for others."""
     finite = values[np.isfinite(values)]
-    is_flat = finite.size > 1 and np.ptp(finite) <= AS_GOOD * np.abs(finite).max()
-    return f"flat: within {100 * AS_GOOD:g} %" if is_flat else ""
+    return (
+        f"flat: within {100 * AS_GOOD:g} %" if finite.size > 1 and np.ptp(finite) <= AS_GOOD * np.abs(finite).max() else ""
+    )
 
 
 def colour_scale(values: Array, label: str, scale: str) -> Scale:
@@ -210,11 +208,11 @@ def colour_scale(values: Array, label: str, scale: str) -> Scale:
 def cell_edges(centres: Array, log: bool) -> Array:
     """Cell edges halfway between centres, in the axis's own scale."""
     points = np.log(centres) if log else centres
+    # one more centre at either end, as far away as the one inside
+    extended = np.pad(points, 1, "reflect", reflect_type="odd")
+    edges = 0.5 * (extended[1:] + extended[:-1])
     if len(points) == 1:
-        edges = points + np.array([-0.5, 0.5]) * (1.0 if log else abs(points[0]) or 1.0)
-    else:
-        middle = 0.5 * (points[1:] + points[:-1])
-        edges = np.concatenate([2 * points[:1] - middle[:1], middle, 2 * points[-1:] - middle[-1:]])
+        edges += np.array([-0.5, 0.5]) * (1.0 if log else abs(points[0]) or 1.0)
     return np.exp(edges) if log else edges
 
 
@@ -222,8 +220,7 @@ def _split(table: Any, path: str | None) -> list[tuple[Any, Any]]:
     """The value of each panel or line, and its part of a table or of rows; None and all where there is one alone."""
     if path is None:
         return [(None, table)]
-    parts = table.groupby(path, sort=True)
-    return [(value, part.droplevel(0) if path in part.index.names else part) for value, part in parts]
+    return [(value, part.droplevel(0) if path in part.index.names else part) for value, part in table.groupby(path)]
 
 
 def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Series:
@@ -235,7 +232,7 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Ser
     def bounds(frame: DataFrame) -> Series:
         return frame[f"{side}.f_plus"].where(points.on_coarse_grid(frame))
 
-    groups = Groups(rows, [] if spec.facet is None else [spec.facet])
+    groups = Groups(rows, [*filter(None, [spec.facet])])
     medians = groups.spread(lambda frame: bounds(frame).where(frame[f"{side}.converged"].astype(bool)))["median"]
     return medians.fillna(groups.spread(bounds)["median"]) if medians.isna().any() else medians
 
@@ -243,8 +240,9 @@ def _bounds(rows: Iterable[DataFrame], spec: FigureTable, points: Points) -> Ser
 def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> tuple[list[Panel], str]:
     """A map; points of a refined study that were not simulated show the nearest that was."""
     assert spec.y is not None
-    side, paths, axes = spec.value.partition(".")[0], config.axis_paths, (spec.x, spec.y)
-    keys = [path for path in (spec.facet, spec.y, spec.x) if path is not None]
+    metric, paths, axes = spec.value, config.axis_paths, (spec.x, spec.y)
+    side = metric.partition(".")[0]
+    keys = [*filter(None, (spec.facet, spec.y, spec.x))]
     simulated = groups = Groups(rows, keys, paths)
     filling, filled = None, rows
     if points.refinement is not None:
@@ -253,18 +251,18 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         unseen = [path for path in paths if path not in keys]
         filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec.facet)]
         groups = Groups(filled, keys, paths)
-    table, converged = _map_table(groups, spec.value), f"{side}.converged"
+    table, converged = _map_table(groups, metric), f"{side}.converged"
     bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
-    errors, judged = {}, re.search(r"rmse|chatter|convergence_time$", spec.value) and converged in table
+    errors, judged = {}, re.search(r"rmse|chatter|convergence_time$", metric) and converged in table
     if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
         # of a refined study those that were simulated
-        errors = dict(_split(worst_runs(simulated, spec.value), spec.facet))
+        errors = dict(_split(worst_runs(simulated, metric), spec.facet))
     # what failed sets no colour
     table["shown"] = table["value"].where(~table["failed"])
-    scale = colour_scale(table["shown"].to_numpy(float), value_label(spec.value), spec.scale)
-    if is_boolean(spec.value):
+    scale = colour_scale(table["shown"].to_numpy(float), value_label(metric), spec.scale)
+    if is_boolean(metric):
         scale = scale._replace(low=0.0, high=1.0, log=False)
-    failure, drawn = _failure_name(table[table["failed"]], spec.value), []
+    failure, drawn = _failure_name(table[table["failed"]], metric), []
     for i, (value, part) in enumerate(_split(table, spec.facet)):
         plane = part[["value", "failed"]].astype(float)
         # what an unfinished study has not computed yet stays white
@@ -277,7 +275,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         if errors and (best := best_gains(errors[value])):
             place = errors[value].index[best.index]
             parts += [mark(*place[::-1], "best", size=13.0)]
-            under.append(f"best ★ {part['value'][place]:.2g} {find_metric(spec.value).unit}".rstrip())
+            under.append(f"best ★ {part['value'][place]:.2g} {find_metric(metric).unit}".rstrip())
         if bounds is not None:
             bound, alpha_is_x = bounds[i], spec.x.endswith(".alpha")
             alphas = (x if alpha_is_x else y).ends
@@ -326,12 +324,12 @@ def worst_runs(groups: Groups, value: str) -> DataFrame:
     """The worst run of each group: its `error`, the least of each of `MARGINS` that the observers have, the share that
     `converged`, and the relative standard error of the mean (`scatter`) where its runs differ by the noise alone."""
     side, column = value.partition(".")[0], partial(drawn_values, value=value)
-    columns: dict[str, Column] = {"mean": column, "square": lambda frame: column(frame) ** 2}
-    means = groups.means(columns | {"converged": itemgetter(f"{side}.converged")})
+    means = groups.means({
+        "mean": column, "square": lambda frame: column(frame) ** 2, "converged": itemgetter(f"{side}.converged"),
+    })  # fmt: skip
     scatter = 0.0
     if not groups.varied - set(groups.index.names):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = np.maximum(means["square"] / means["mean"] ** 2 - 1.0, 0.0) / (means["rows"] - 1.0)
+        variance = (means["square"] / means["mean"] ** 2 - 1.0).clip(lower=0.0) / (means["rows"] - 1.0)
         scatter = np.sqrt(variance.where(means["rows"] > 1, 0.0))
     for margin in MARGINS:
         if f"{side}.{margin}" in groups.columns:
@@ -355,24 +353,23 @@ def best_gains(runs: DataFrame) -> BestGains | None:
 
 
 def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], str]:
-    keys = [path for path in (spec.facet, spec.series, spec.x) if path is not None]
-    groups = Groups(rows, keys, config.axis_paths)
-    column = partial(drawn_values, value=spec.value)
+    groups = Groups(rows, [*filter(None, (spec.facet, spec.series, spec.x))], config.axis_paths)
+    metric = spec.value
+    column = partial(drawn_values, value=metric)
     spread = groups.spread(column)
-    table = groups.means({"mean": column}).join(spread)
     band, drawn = "", []
-    scale = colour_scale(spread.to_numpy(), value_label(spec.value), spec.scale)
-    middle = "mean" if is_boolean(spec.value) else "median"
-    for facet, part in _split(table.reset_index(), spec.facet):
+    scale = colour_scale(spread.to_numpy(), value_label(metric), spec.scale)
+    middle = "mean" if is_boolean(metric) else "median"
+    for facet, part in _split(groups.means({"mean": column}).join(spread).reset_index(), spec.facet):
         parts = []
         for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
             x, name = line[spec.x], with_value(config, spec.series, value)
-            if (line["rows"] > 1).any() and not is_boolean(spec.value):
+            if (line["rows"] > 1).any() and not is_boolean(metric):
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
             parts.append(Line(x, line[middle], name, colour, marker="o", size=3.5))
         x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
-        drawn.append(Panel(x, Axis(scale.label, spec.value, scale.log), parts, with_value(config, spec.facet, facet)))
+        drawn.append(Panel(x, Axis(scale.label, metric, scale.log), parts, with_value(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
 
 
@@ -383,10 +380,10 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
         parts, members = [], [law for law in laws if law.where.get(spec.facet) == facet]
         for law, colour in zip(members, cycle(COLOURS), strict=False):
             lead = "".join(f"{_text(value)}: " for value in law.series.values())
-            slope, x, y = "no law", [], []
-            if law.fit is not None:
-                slope, x = slope_text(law.fit), law.x_values[[law.fit.first, law.fit.last]]
-                y = law.fit(x)
+            slope, x, y, fit = "no law", [], [], law.fit
+            if fit is not None:
+                slope, x = slope_text(fit), law.x_values[[fit.first, fit.last]]
+                y = fit(x)
             errors = np.where(law.y_values > 0.0, law.y_values, np.nan)
             parts += [
                 Line(law.x_values, errors, colour=colour, width=0.0, marker="o", size=3.5),

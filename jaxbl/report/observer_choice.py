@@ -22,7 +22,7 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .maps import axis_label, with_value
 from .panels import SIDE_COLOURS, Axis, Figure, Line, Map, Panel, Scale, Span, arrange, intervals, name_rows, tick_text
-from .tune import error_label, for_title, write_gains
+from .tune import error_label, for_title
 
 
 def draw(choice: ObserverChoice) -> list[Figure]:
@@ -55,8 +55,7 @@ def _ratios(summary: JsonObject) -> Figure:
         f"{error_label(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with "
         "its 95 % interval where they differ."
     )
-    height = 0.9 + 0.34 * len(summary["observers"])
-    return Figure("observers", panels, caption, len(panels), 5.2 * len(panels), height)
+    return Figure("observers", panels, caption, len(panels), 5.2 * len(panels), 0.9 + 0.34 * len(summary["observers"]))
 
 
 def _lost_kinds(kinds: JsonObject) -> list[str]:
@@ -106,26 +105,25 @@ def _map(config: Config, summary: JsonObject, side: str) -> Figure:
     varied, short, kinds = _varied_values(config, summary, side), short_names(summary["observers"]), summary["observers"]
     # over one axis a map has a single row
     (x, xs), (y, ys), *_ = [*reversed(varied.items()), ("", [None])]
-    further = {path: values for path, values in varied.items() if path not in (x, y)}
+    further = dict([*varied.items()][:-2])
     points = {
         tuple(point["values"].get(path) for path in (*further, y, x)): point["sides"][side] for point in summary["points"]
     }
-    x_axis, y_axis = _axis(config, x, xs), _axis(config, y, ys) if y else Axis(names=((0.0, ""),))
+    axes = _axis(config, x, xs), _axis(config, y, ys) if y else Axis(names=((0.0, ""),))
     edges = [np.arange(len(values) + 1) - 0.5 for values in (xs, ys)]
-    scale = Scale(-0.5, 9.5, "", colours="tab10")
     numbers = {kind: i % 10 for i, kind in enumerate(kinds)}
-    winners = {point["best"] for point in points.values()} - {None}
+    winners = {point["best"] for point in points.values()}
     panels, columns = [], arrange(math.prod(map(len, further.values())))
     for values in product(*further.values()):
         cells = [points[*values, v, u] for v in ys for u in xs]
         best = np.array([numbers.get(cell["best"], np.nan) for cell in cells]).reshape(len(ys), len(xs))
         rows_of_cells, columns_of_cells = np.indices(best.shape).reshape(2, -1)
         parts = [
-            Map(*edges, best, scale, np.isnan(best), "all diverge, or are too slow"),
+            Map(*edges, best, Scale(-0.5, 9.5, "", colours="tab10"), np.isnan(best), "all diverge, or are too slow"),
             Line(columns_of_cells, rows_of_cells, width=0.0, texts=[_cell_text(cell, short) for cell in cells]),
         ]
         title = ", ".join(with_value(config, *pair) for pair in zip(further, values, strict=True))
-        panels.append(Panel(x_axis, y_axis, parts, title))
+        panels.append(Panel(*axes, parts, title))
     names = ", ".join(f"{short[kind]}: {kind}" for kind in kinds if kind in winners)
     caption = (
         f"{side}: the kind with the least {error_label(summary)} at each point ({names}), {_where(summary)}, and below it "
@@ -145,10 +143,10 @@ def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
     return text if best == reference else f"{text}\n{short[reference]} {'–' if ratio is None else f'×{ratio:.2g}'}"
 
 
-def write(choice: ObserverChoice, folder: Path) -> str:
-    """Write `gains.toml` of a single point. Returns the study's TOML."""
-    gains = observer_toml(choice.summary)
-    return choice.config.to_toml() if gains is None else write_gains(choice, folder, gains)
+def write(choice: ObserverChoice, folder: Path) -> None:
+    """Write `gains.toml` of a single point."""
+    if gains := observer_toml(choice.summary):
+        (folder / "gains.toml").write_text(gains, encoding="utf-8")
 
 
 def describe(choice: ObserverChoice) -> Result:
@@ -244,11 +242,12 @@ def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
         return tables
     axes = summary["axes"]
     for side in points[0]["sides"]:
-        rows = []
-        for point in points:
-            result = point["sides"][side]
-            values, ratios = (point["values"][path] for path in axes), (_ratio(result["kinds"][kind]) for kind in kinds)
-            rows.append([*values, result["best"] or "none", ", ".join(result["not_told_apart"]), *ratios])
+        rows = [
+            [*(point["values"][path] for path in axes), result["best"] or "none", ", ".join(result["not_told_apart"]),
+             *(_ratio(result["kinds"][kind]) for kind in kinds)]
+            for point in points
+            if (result := point["sides"][side])
+        ]  # fmt: skip
         columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
         tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
     return tables

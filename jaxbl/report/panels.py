@@ -219,12 +219,10 @@ def intervals(
     places: Any, low: Any, middle: Any, high: Any, name: str = "", *, upright: bool = False, **how: Any
 ) -> list[Line]:
     """Points with intervals `(n,)`, lying unless `upright`; `how` is of the points (:class:`Line`)."""
-    ends = np.stack([low, high, np.full(len(low), np.nan)], axis=1).ravel()
-    rows = np.repeat(np.asarray(places, float), 3)
-    pairs = (ends, rows), (middle, places)
-    bar, points = ((y, x) if upright else (x, y) for x, y in pairs)
-    bars = Line(*bar, colour=how.get("colour", BLACK), width=1.8, opacity=0.6)
-    return [bars, Line(*points, name, **{"width": 0.0, "marker": "o"} | how)]
+    ends = np.column_stack([low, high, np.full(len(low), np.nan)]).ravel()
+    bars = Line(ends, np.repeat(places, 3), colour=how.get("colour", BLACK), width=1.8, opacity=0.6)
+    lines = [bars, Line(middle, places, name, **{"width": 0.0, "marker": "o"} | how)]
+    return [line._replace(x=line.y, y=line.x) for line in lines] if upright else lines
 
 
 def mark(x: float, y: float, name: str, marker: str = "*", size: float = 14.0) -> Line:
@@ -293,7 +291,7 @@ def limits(*values: Any, inside: Sequence[float] = ()) -> Pair | None:
 
 def round_ticks(low: float, high: float) -> list[float]:
     """Round places on a logarithmic axis: its decades, or of fewer than two 1, 2 and 5 in each."""
-    first, last = (math.log10(end) for end in sorted((low, high)))
+    first, last = sorted(map(math.log10, (low, high)))
     leads = (1.0,) if last - first >= 2.0 else (1.0, 2.0, 5.0)
     step = max(math.ceil((last - first) / 8.0), 1)
     decades = range(step * math.floor(first / step), math.ceil(last) + 1, step)
@@ -360,7 +358,9 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         content[name] = {
             "label": axis.label.replace("\n", " "), "key": axis.key, "log": axis.log,
             "ends": [float(f"{end:.8g}") for end in drawn_ends],
-        } | ({"names": [[place, text.replace("\n", ", ")] for place, text in axis.names]} if axis.names else {})  # fmt: skip
+        }  # fmt: skip
+        if axis.names:
+            content[name]["names"] = [[place, text.replace("\n", ", ")] for place, text in axis.names]
     content |= {kind: [] for kind in ("lines", "bands", "spans")}
     for part in map(thin, panel.parts):
         if isinstance(part, Line | Band | Span):

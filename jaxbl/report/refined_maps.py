@@ -33,8 +33,7 @@ class Filling:
 
     def _places(self, frame: DataFrame) -> Array:
         """Positions `(rows, 2)` of a frame's rows in the plane, in coarse cells."""
-        places = [np.searchsorted(values, frame[path]) / cell for path, (values, cell) in self._axes.items()]
-        return np.stack(places, axis=1)
+        return np.column_stack([np.searchsorted(values, frame[path]) / cell for path, (values, cell) in self._axes.items()])
 
     def _nearest(self, simulated: DataFrame, asked: DataFrame) -> Array:
         """The simulated row nearest to each row asked for, within half a coarse cell; their number where there is none."""

@@ -44,7 +44,7 @@ class _Kind(NamedTuple):
     Attributes:
         report: module with `describe`, which says what was found (of logs by the summary), `draw`, which draws the figures
             (the first is the one beside the answer), and `write`, which writes further files beside the page into a folder
-            and returns the study or model that the page shows, as TOML.
+            and returns the study or model that the page shows, as TOML; nothing where that is the result's `config`.
         file: what was found, as data, or the page where that is all; names the result in the manifest of its folder.
         subject: what the result is about.
         summary: what the file holds.
@@ -149,11 +149,13 @@ def write_report(result: Any, folder: str | Path | ResultFolder, described: Resu
             stack.enter_context(lock_folder(place, wait=_WAIT))
             folder = ResultFolder.read(place) or ResultFolder(place, kind.subject(result))
         # without details, of which one is how long compiling took: the same results have the same manifest
-        card = {"title": described.title, "sentences": replace(described, details=()).sentences}
-        draft = stack.enter_context(folder.write_files(kind.file, identity=identity, **card))
+        sentences = replace(described, details=()).sentences
+        draft = stack.enter_context(
+            folder.write_files(kind.file, identity=identity, title=described.title, sentences=sentences)
+        )
         if kind.file != PAGE:
             write_json(draft / kind.file, to_jsonable(kind.summary(result)))
-        config = kind.report.write(result, draft)
+        config = kind.report.write(result, draft) or result.config.to_toml()
         write_page(draft, described, kind.report.draw(result), config)
     return described
 

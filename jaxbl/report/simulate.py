@@ -15,17 +15,15 @@ from .gain_plane import conditions_line, draw_gain_plane
 from .panels import SIDE_COLOURS, SIDES, TIME, VERMILION, ZERO, Axis, Figure, Line, Panel
 
 
-def write(trial: Trial, folder: Path) -> str:
-    """Write the trace of a run. Returns the study's TOML."""
+def write(trial: Trial, folder: Path) -> None:
+    """Write the trace of a run."""
     trial.trace.to_parquet(folder / "trace.parquet", index=False)
-    return trial.config.to_toml()
 
 
 def describe(trial: Trial) -> Result:
     """Say whether the observers converged, and how large their errors are."""
-    summary, metrics, limits = trial.summary, trial.summary["metrics"], trial.config.run
-    judged = summary["conditions"]
-    sides, drive = trial.config.sides, trial.config.drive.build()
+    config, summary, metrics = trial.config, trial.summary, trial.summary["metrics"]
+    judged, sides, drive = summary["conditions"], config.sides, config.drive.build()
     failed = [side for side in sides if not metrics[f"{side}.converged"]]
     verdict, headline = "failed", "The run diverges: a number overflows."
     if metrics["finite"] and failed:
@@ -39,11 +37,11 @@ def describe(trial: Trial) -> Result:
             verdict = "doubtful"
             headline = f"{headline} By the exact condition, the gains of {who} do not ensure that at another start or input."
     quantities = [*itertools.product(sides, ("velocity", "torque"))]
-    if trial.config.controller is not None:
-        quantities += [(trial.config.controller.side, "following")]
+    if config.controller is not None:
+        quantities += [(config.controller.side, "following")]
     figures = []
     for side, quantity in quantities:
-        error, largest = metrics[f"{side}.{quantity}_rmse"], limits.velocity_tolerance / drive.ratio(side)
+        error, largest = metrics[f"{side}.{quantity}_rmse"], config.run.velocity_tolerance / drive.ratio(side)
         bound = f"; at any time at most {largest:.3g} is allowed" if quantity == "velocity" else ""
         text = "diverges" if error is None else f"{error:.3g} {SIDE_METRICS[f'{quantity}_rmse'].unit}"
         figures.append(KeyFigure(text, f"{side}: {quantity} error, rms{bound}"))
@@ -57,8 +55,7 @@ def describe(trial: Trial) -> Result:
         rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
         tables.insert(0, ResultTable("Identified", ["", "true", *sides], rows))
     remarks = [conditions_line(side, gains, "the true bound along this run") for side, gains in judged.items()]
-    title = trial.config.title or "Run"
-    return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
+    return Result(config.title or "Run", verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
 def draw(trial: Trial) -> list[Figure]:
@@ -68,15 +65,15 @@ def draw(trial: Trial) -> list[Figure]:
     name, seen_from = ("transmitted torque C", SIDES) if is_geared else ("disturbance torque", ("motor",))
     estimates = {f"from the {side} observer": (f"{side}.torque_estimate", SIDE_COLOURS[side]) for side in seen_from}
     caption = f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16)."
-    figures = [_compare("torque", trace, name, "N m", ("true", "torque"), estimates, caption)]
+    figures = [_compare("torque", trace, name, "N m", "true", "torque", estimates, caption)]
     for side in trial.config.sides:
         name, observed = f"{side}.velocity", {"observer": (f"{side}.velocity_estimate", VERMILION)}
         caption = f"{side.capitalize()} velocity, true and observed, and the error."
-        figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", ("true", name), observed, caption))
+        figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", "true", name, observed, caption))
     if controller is not None:
         name, moved = f"{controller.side} position", {"true": (f"{controller.side}.position", VERMILION)}
         caption = f"{controller.side.capitalize()} position, the reference that it is to follow, and the error."
-        figures.append(_compare("following", trace, name, "rad", ("reference", "reference"), moved, caption))
+        figures.append(_compare("following", trace, name, "rad", "reference", "reference", moved, caption))
     judged = trial.summary["conditions"]
     figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
     figures += itertools.chain(*(error_plane(trace, side, gains) for side, gains in judged.items()))
@@ -88,14 +85,15 @@ def _compare(
     trace: DataFrame,
     quantity: str,
     unit: str,
-    reference: tuple[str, str],
+    label: str,
+    column: str,
     estimates: Mapping[str, tuple[str, str]],
     caption: str,
 ) -> Figure:
     """A signal (its label and column) with what follows it (column and colour by label), over time, and below by how much
     these are off."""
-    label, time, true = reference[0], trace["t"], trace[reference[1]]
-    above = [Line(time, trace[column], key, colour, 2.0, opacity=0.75) for key, (column, colour) in estimates.items()]
+    time, true = trace["t"], trace[column]
+    above = [Line(time, trace[estimate], key, colour, 2.0, opacity=0.75) for key, (estimate, colour) in estimates.items()]
     below = [line._replace(y=true - line.y, name="", width=1.0) for line in above]
     panels = [
         Panel(TIME, Axis(f"{quantity} ({unit})"), [*above, Line(time, true, label, width=1.0)]),

@@ -15,7 +15,7 @@ from jaxbl.gains.accuracy_laws import AGREEMENT, END_OF_SWEEP, Law
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.lines import percent
 from jaxbl.result import KeyFigure, Result, ResultTable
-from jaxbl.sweeps.axis_importance import AxisImportance, rank_axes
+from jaxbl.sweeps.axis_importance import rank_axes
 from jaxbl.sweeps.metrics import find_metric, is_magnitude
 from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.sweep import StudyResult
@@ -26,11 +26,10 @@ from .gain_plane import say_thin_reserve
 from .maps import MARGINS, best_gains, draw as draw, laws_of, slope_text, value_words, with_value, worst_runs
 
 
-def write(result: StudyResult, folder: Path) -> str:
-    """Write `laws.json` if figures ask for laws. Returns the study's TOML."""
+def write(result: StudyResult, folder: Path) -> None:
+    """Write `laws.json` if figures ask for laws."""
     if laws := laws_of(result):
         write_json(folder / "laws.json", [law.to_dict() for law in laws])
-    return result.config.to_toml()
 
 
 def describe(result: StudyResult) -> Result:
@@ -68,37 +67,31 @@ def answer_sweep(result: StudyResult) -> Result:
             KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})"),
             KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}"),
         ]
-    works = survey.diverged < survey.runs and all(survey.converged.values())
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
-    partly |= any(best is None for best, _ in survey.best.values())
-    thin = say_thin_reserve({side: best.margin for side, (best, _) in survey.best.items() if best is not None})
+    reserves = {side: best.margin for side, (best, _) in survey.best.items() if best is not None}
+    partly |= len(reserves) < len(survey.best)
+    thin = say_thin_reserve(reserves)
     verdict = "doubtful" if not finished or partly or thin else "good"
-    if finished and not works:
+    if finished and not (survey.diverged < survey.runs and all(survey.converged.values())):
         verdict = "failed"
     elif verdict == "good" and not survey.converged:
         # of what no convergence is asked nothing is good or bad
         verdict = "no answer"
-    figures += (_importance_figure(side, ranked[0]) for side, ranked in survey.importance.items())
+    tables = []
+    for side, ranked in survey.importance.items():
+        first, heading = ranked[0], f"{side}: which axis matters for the velocity error"
+        way = "" if first.total is None else " and what it does together with others"
+        text = (
+            f"of the {side} observer's velocity error goes with {first.path}{way} (share of the variance of its logarithm)"
+        )
+        figures.append(KeyFigure(_share(first.total or first.alone), text))
+        rows = [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked]
+        tables.append(ResultTable(heading, ["axis", "by itself", "with others"], rows))
     # the headline has the first
     figures += survey.list_ranges()[1:]
-    tables = [
-        ResultTable(
-            f"{side}: which axis matters for the velocity error",
-            ["axis", "by itself", "with others"],
-            [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked],
-        )
-        for side, ranked in survey.importance.items()
-    ]
     headline = " ".join(filter(None, (_headline(result, survey), thin)))
     return Result(config.title or "Study", verdict, headline, figures, remarks, config.notes, tables)
-
-
-def _importance_figure(side: str, axis: AxisImportance) -> KeyFigure:
-    """The axis that matters most for a side's velocity error."""
-    share, way = (axis.alone, "") if axis.total is None else (axis.total, " and what it does together with others")
-    text = f"of the {side} observer's velocity error goes with {axis.path}{way} (share of the variance of its logarithm)"
-    return KeyFigure(_share(share), text)
 
 
 def _share(share: tuple[float, float] | None) -> str:
@@ -125,16 +118,18 @@ class _Survey:
     def __init__(self, result: StudyResult):
         config = result.config
         paths = config.axis_paths
-        names = "converged", "velocity_rmse", *MARGINS
-        metrics = [column for column in result.columns if column.rpartition(".")[2] in names]
+        metrics = [name for name in result.columns if name.rpartition(".")[2] in ("converged", "velocity_rmse", *MARGINS)]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
         points = Points(config)
         varied = [axis.path for axis in config.axes if values_of(config, axis) > 1] * (config.sweep.design == "grid")
         self.runs = self.even = self.diverged = 0
         self.converged = {side: 0 for side in config.sides if f"{side}.converged" in metrics}
         self.best, self.importance, self.by_value = {}, {}, {}
-        drawn = [] if self.converged else [figure.value for figure in config.figures if not is_boolean(figure.value)]
-        self.ranges = {column: (math.inf, -math.inf, 0) for column in drawn if column in result.columns}
+        self.ranges = {
+            figure.value: (math.inf, -math.inf, 0)
+            for figure in config.figures
+            if figure.value in result.columns and not (self.converged or is_boolean(figure.value))
+        }
         for frame in result.batches([*paths, "seed", "finite", *metrics, *self.ranges]):
             even = frame[points.on_coarse_grid(frame)]
             self.runs += len(frame)
@@ -154,8 +149,7 @@ class _Survey:
                 self.importance[side] = ranked
             if error in metrics and side in self.converged and gains:
                 columns = [*paths, "finite", *(name for name in metrics if name.startswith(side))]
-                groups = Groups(Rows(result, columns), gains, paths)
-                runs = worst_runs(groups, error)
+                runs = worst_runs(Groups(Rows(result, columns), gains, paths), error)
                 self.best[side] = best_gains(runs), runs
 
     def find_edge(self, side: str) -> tuple[str, float, float, float] | None:
@@ -174,11 +168,10 @@ class _Survey:
         """From where to where metrics go, and in how many runs they are 0."""
         figures = []
         for column, (low, high, zeros) in self.ranges.items():
-            if low > high:
-                # no run has a number
-                continue
-            none = f" (0 in {percent(zeros / self.runs)} of the runs)" if zeros else ""
-            figures.append(KeyFigure(f"{low:.3g} to {high:.3g} {find_metric(column).unit}{none}", value_words(column)))
+            # of a metric that no run has, nothing
+            if low <= high:
+                none = f" (0 in {percent(zeros / self.runs)} of the runs)" if zeros else ""
+                figures.append(KeyFigure(f"{low:.3g} to {high:.3g} {find_metric(column).unit}{none}", value_words(column)))
         return figures
 
 
@@ -216,19 +209,19 @@ def _explain_ends(law: Law) -> str:
 
 def _place(law: Law) -> str:
     """The values that a line of a law is for; a word stands without its path."""
-    pairs = {**law.series, **law.where}.items()
+    pairs = (law.series | law.where).items()
     return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
 
 
 def _law_table(laws: list[Law]) -> ResultTable:
     rows = []
     for law in laws:
-        line, slope, halves, ends = f"{law.value} over {law.x}", "no law", "–", "–"
-        if law.fit is not None:
-            slope, halves = slope_text(law.fit), f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
-        if law.range is not None:
-            ends = f"{law.range[0]:g} to {law.range[1]:g} ({law.in_range.sum()})"
-        slope, halves, ends = (text.replace(" ", "\u00a0") for text in (slope, halves, ends))
+        texts = "no law", "–", "–"
+        if law.fit is not None and law.range is not None:
+            halves = f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
+            texts = slope_text(law.fit), halves, f"{law.range[0]:g} to {law.range[1]:g} ({law.in_range.sum()})"
+        slope, halves, ends = (text.replace(" ", "\u00a0") for text in texts)
+        line = f"{law.value} over {law.x}"
         rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _explain_ends(law)])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return ResultTable("Accuracy laws", columns, rows)

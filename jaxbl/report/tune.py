@@ -2,7 +2,6 @@
 
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -35,11 +34,12 @@ def error_label(summary: JsonObject) -> str:
 def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
     gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
-    coarse = tuning.candidates[side].query("stage == 0")
-    names = "error", "converged", "convergence_time"
-    error, converged, time = (coarse.pivot(index="lambda", columns="alpha", values=name) for name in names)
+    # the coarse map
+    runs = tuning.candidates[side].query("stage == 0").pivot(index="lambda", columns="alpha")
+    error = runs["error"]
     longest = np.inf if (table := tuning.config.tune) is None else table.longest_convergence or np.inf
-    grid, failed = error.to_numpy(float), ~(converged.to_numpy(bool) & (time.to_numpy(float) <= longest))
+    works = runs["converged"] & (runs["convergence_time"] <= longest)
+    grid, failed = error.to_numpy(float), ~works.to_numpy(bool)
     values = np.where(failed, np.nan, grid)
     x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
     alphas, lambdas = ((edges[0], edges[-1]) for edges in (x, y))
@@ -69,8 +69,8 @@ def _map(tuning: Tuning, side: str) -> Figure:
 def _missing(names: list[str]) -> str:
     """Say what gains do that miss constraints."""
     margins = " and ".join(name for name in names if name != "converged")
-    parts = [f"misses {margins}"] if margins else []
-    return " and ".join([*parts, "does not converge"] if "converged" in names else parts)
+    parts = margins and f"misses {margins}", "does not converge" * ("converged" in names)
+    return " and ".join(filter(None, parts))
 
 
 _GAINS = ("lambda", "λ", "√rad/s"), ("alpha", "α", "rad/s²")
@@ -96,16 +96,10 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     return f"error {_size(way['change'])} at {place}{cause}{f', {joint} it {missed}' if missed else ''}"
 
 
-def write(tuning: Tuning, folder: Path) -> str:
-    """Write `gains.toml` and certificates. Returns the study's TOML."""
+def write(tuning: Tuning, folder: Path) -> None:
+    """Write `gains.toml` and certificates."""
     write_certificates(tuning.summary, folder)
-    return write_gains(tuning, folder, gains_toml(tuning.summary))
-
-
-def write_gains(tuning: Any, folder: Path, gains: str) -> str:
-    """Write gains as TOML. Returns the study's TOML."""
-    (folder / "gains.toml").write_text(gains, encoding="utf-8")
-    return tuning.config.to_toml()
+    (folder / "gains.toml").write_text(gains_toml(tuning.summary), encoding="utf-8")
 
 
 def describe(tuning: Tuning) -> Result:
@@ -122,8 +116,7 @@ def describe(tuning: Tuning) -> Result:
     elif "range" in matter:
         verdict, headline = "doubtful", f"Better gains may lie beyond the range searched; of those in it take {chosen}."
     certified = certificate_lines(summary)
-    reserves = {side: min(entry["margins"].values()) for side, entry in summary["verdict"].items()}
-    if thin := say_thin_reserve(reserves):
+    if thin := say_thin_reserve({side: entry["margin"] for side, entry in summary["verdict"].items()}):
         verdict, headline = "doubtful", f"{headline} {thin}"
     if beaten := _better_gains(summary):
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
@@ -141,8 +134,9 @@ def describe(tuning: Tuning) -> Result:
         *certificate_tables(summary),
         _comparison_table(f"{where}, worst and median of all runs", holdout["rows"]),
     ]
-    title = tuning.config.title or "Gains"
-    return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), remarks, details, tables))
+    return lead_with_doubt(
+        Result(tuning.config.title or "Gains", verdict, headline, _key_figures(summary), remarks, details, tables)
+    )
 
 
 def _better_gains(summary: JsonObject) -> list[str]:
@@ -162,16 +156,16 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     metric, figures = f"{summary['objective']}_rmse", []
     for side, verdict in summary["verdict"].items():
         worst, factors = summary["achieved"][side][metric], summary["holdout"]["factors"][side]
-        factors_text = [
-            f"× {factor[metric]['worst']:.3g} with {describe_gains(name)}"
+        texts = (
+            f" (× {factor[metric]['worst']:.3g} with {describe_gains(name)})"
             for name, factor in factors.items()
             if "why_none" not in factor and factor[metric]["worst"] is not None
+        )
+        meaning = f"{side}: worst {summary['objective']} error, rms{next(texts, '')}"
+        figures += [
+            KeyFigure(f"{worst:.3g} {SIDE_METRICS[metric].unit}", meaning),
+            KeyFigure(f"× {verdict['margin']:.3g}", f"{side}: change of the gains until they fail or err twice as much"),
         ]
-        besides = f" ({factors_text[0]})" if factors_text else ""
-        meaning = f"{side}: worst {summary['objective']} error, rms{besides}"
-        figures.append(KeyFigure(f"{worst:.3g} {SIDE_METRICS[metric].unit}", meaning))
-        reach = min(verdict["margins"].values())
-        figures.append(KeyFigure(f"× {reach:.3g}", f"{side}: change of the gains until they fail or err twice as much"))
     return figures
 
 

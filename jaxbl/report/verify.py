@@ -21,7 +21,6 @@ from .loop_gains import margin_table
 from .maps import cell_edges
 from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mark
 
-_USUAL = 1.1, 1.5, "usual pair (1.5, 1.1)"
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 
 
@@ -30,16 +29,16 @@ def draw(verdict: Verdict) -> list[Figure]:
     `jaxbl explore`."""
     plane = verdict.error_map
     scale = Scale(0.05, 20.0, "ratio ρ of successive velocity peaks, simulated", True, "PuOr_r")
-    ranges = {"α / f⁺": plane.alpha, "λ / √f⁺": plane.lambda_}
+    alphas = plane.alpha
+    ranges = {"α / f⁺": alphas, "λ / √f⁺": plane.lambda_}
     edges = [cell_edges(values, True) for values in ranges.values()]
-    curves = condition_curves(list_conditions(verdict.config), 1.0, (plane.alpha[0], plane.alpha[-1]))
-    step = max(len(plane.alpha) // 24, 1)
-    boundary = Line(plane.alpha[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
-    own_gains = _judge_own_gains(verdict).items()
+    curves = condition_curves(list_conditions(verdict.config), 1.0, (alphas[0], alphas[-1]))
+    step = max(len(alphas) // 24, 1)
+    boundary = Line(alphas[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
     places = [
         *((gains["alpha"] / bound, gains["lambda"] / bound**0.5, f"the study's gains, {side}")
-          for side, gains in own_gains if (bound := gains["f_plus"]) > 0.0),
-        _USUAL,
+          for side, gains in _judge_own_gains(verdict).items() if (bound := gains["f_plus"]) > 0.0),
+        (1.1, 1.5, "usual pair (1.5, 1.1)"),
         *((gains["alpha_ratio"], gains["lambda_ratio"], gains["name"])
           for gains in verdict.summary["marks"] if gains["alpha_ratio"] is not None),
     ]  # fmt: skip
@@ -57,17 +56,15 @@ def draw(verdict: Verdict) -> list[Figure]:
     return [Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)]
 
 
-def write(verdict: Verdict, folder: Path) -> str:
-    """Return the study's TOML; the command has left the other files."""
-    return verdict.config.to_toml()
+def write(verdict: Verdict, folder: Path) -> None:
+    """Write nothing: the command has left the other files."""
 
 
 def describe(verdict: Verdict) -> Result:
     """Say whether the study's own gains and the marked ones are safe, and which conditions are wrong."""
     marks, levels, own_gains = verdict.summary["marks"], verdict.summary["levels"], _judge_own_gains(verdict)
     unsafe = [gains["name"] for gains in marks if (gains["peak_ratio"] or np.inf) >= 1.0]
-    exact = (entry for level in levels for entry in level["conditions"] if entry["name"] == "exact")
-    failures = sum(entry["counterexamples"] for entry in exact)
+    failures = sum(entry["counterexamples"] for level in levels for entry in level["conditions"] if entry["name"] == "exact")
     extent = (
         f"{levels[0]['cells']} cells of the error system and {sum(level['cells'] for level in levels[1:])} runs of the drive"
     )
@@ -101,8 +98,7 @@ def describe(verdict: Verdict) -> Result:
         tables.append(margin_table(margins))
     remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own_gains.items()]
     remarks += _level_lines(verdict)
-    title = verdict.config.title or "Gain conditions"
-    return Result(title, word, headline, figures, remarks, verdict.config.notes, tables)
+    return Result(verdict.config.title or "Gain conditions", word, headline, figures, remarks, verdict.config.notes, tables)
 
 
 def _judge_own_gains(verdict: Verdict) -> JsonObject:
@@ -119,9 +115,12 @@ def _level_lines(verdict: Verdict) -> Lines:
     """Say where the observer failed although a condition held, and why."""
     lines = []
     for level in verdict.summary["levels"]:
-        wrong = [entry for entry in level["conditions"] if entry["counterexamples"]]
-        if wrong:
-            counts = ", ".join(f"{entry['title']} {entry['counterexamples']} of {entry['holds']}" for entry in wrong)
+        counts = ", ".join(
+            f"{entry['title']} {entry['counterexamples']} of {entry['holds']}"
+            for entry in level["conditions"]
+            if entry["counterexamples"]
+        )
+        if counts:
             causes = list(level["causes"].get("true", {}).items())[:4]
             text = ", ".join(f"{cause} ({count})" for cause, count in causes)
             name = ", ".join(level[key] for key in ("level", "side") if level.get(key))

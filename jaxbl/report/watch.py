@@ -34,7 +34,7 @@ def describe(watch: Watch) -> Result:
     last, limit, alarm = (summary[key] for key in ("last", "alarm_gap", "alarm"))
     units, count = summary["units"]["motor"], summary["values"]
     verdict, headline = "good", f"Watched: the numbers were determined at {summary['determined']} of {count} times."
-    if limit is not None and alarm is not None:
+    if alarm is not None:
         verdict = "failed"
         headline = (
             f"ALARM from {alarm['t']:.1f} s on: the half gap is beyond {limit:g} {units['half_gap']}, "

@@ -100,7 +100,7 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
         scripts: whether it can be opened from disk.
     """
     points = out / "points.parquet"
-    data = json.dumps({**content, "bytes": points.stat().st_size, "script": _SCRIPT})
+    data = json.dumps(content | {"bytes": points.stat().st_size, "script": _SCRIPT})
     (out / "data.js").write_text(f"jaxblData({data});\n", encoding="utf-8")
     if scripts:
         with points.open("rb") as file:
@@ -112,8 +112,8 @@ def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts:
     for original in originals:
         (out / original.name).write_bytes(original.read_bytes())
     page, elements = (report.joinpath(f"explorer/page/{name}.html").read_text("utf-8") for name in ("page", parts[0]))
-    names = [original.name for original in originals if original.name.endswith(".js")]
-    loaded = "\n".join(f'<script src="{name}"></script>' for name in [*names, "data.js"])
+    names = [*(original.name for original in originals), "data.js"]
+    loaded = "\n".join(f'<script src="{name}"></script>' for name in names if name.endswith(".js"))
     page = page.replace("{parts}", elements).replace("{scripts}", loaded)
     (out / "index.html").write_text(page, encoding="utf-8")
 

@@ -18,13 +18,11 @@ from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.gain_plane import least_lambdas
 from jaxbl.report.maps import MARGINS, axis_words, best_gains, worst_runs
-from jaxbl.report.panels import pack_numbers
+from jaxbl.report.panels import Array, pack_numbers
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
 from .folder import ROW_GROUP, page_values, points_writer
-
-Array = np.ndarray
 
 _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
@@ -46,8 +44,8 @@ def _length(dim: AxisColumns) -> int:
 
 def _places(dim: AxisColumns, frame: pd.DataFrame) -> Array:
     """The places of a frame's rows along a dimension."""
-    values, rows = (table.set_index([*dim]).index for table in (pd.DataFrame(dim), frame))
-    return values.get_indexer(rows)
+    paths = [*dim]
+    return pd.DataFrame(dim).set_index(paths).index.get_indexer(frame.set_index(paths).index)
 
 
 def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path, dims: list[AxisColumns]) -> JsonObject:
@@ -116,14 +114,15 @@ _MOST_JUDGED = 4096
 def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
     """The slice (places along the other dimensions, the seed the last) with the clearest border between what works and what
     fails; where none has a border, that with the largest spread of the metric."""
-    values = cells.get(f"{first.partition('.')[0]}.converged", cells[first])
+    metric = cells[first]
+    values = cells.get(f"{first.partition('.')[0]}.converged", metric)
 
     def rate_slice(index: tuple[int, ...]) -> tuple[float, float]:
-        part = [array[(*index, 0)].reshape(-1) for array in (values, cells[first])]
+        part = [array[(*index, 0)].reshape(-1) for array in (values, metric)]
         works, sizes = (array[:: max(array.size // _MOST_JUDGED, 1)] for array in part)
-        works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes)])
-        share = float(np.mean(works)) if works.size and values is not cells[first] else 0.0
-        spread = float(np.std(np.log(sizes[sizes > 0.0]))) if np.any(sizes > 0.0) else 0.0
+        works, sizes = works[np.isfinite(works)], np.abs(sizes[np.isfinite(sizes) & (sizes != 0.0)])
+        share = float(np.mean(works)) if works.size and values is not metric else 0.0
+        spread = float(np.std(np.log(sizes))) if sizes.size else 0.0
         # tenths: of slices with about the same border that with the larger spread
         return round(10.0 * min(share, 1.0 - share)), spread
 
@@ -141,8 +140,7 @@ def _stars(
     side = first.partition(".")[0]
     paths, values = zip(*(next(iter(dims[i].items())) for i in (y, x)), strict=True)
     shape = cells[first].shape
-    asked = (f"{side}.{name}" for name in ("converged", *MARGINS))
-    needed = [name for name in (first, "finite", *asked) if name in cells]
+    needed = [name for name in (first, "finite", *(f"{side}.{key}" for key in ("converged", *MARGINS))) if name in cells]
     gains = {f"observer.{side}.alpha", f"observer.{side}.lambda"}
     if {*paths} != gains or not {"finite", f"{side}.converged"} <= {*needed} or math.prod(shape[-3:]) > _MOST_STARRED:
         return []

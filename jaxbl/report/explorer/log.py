@@ -37,8 +37,7 @@ def log_source(file: Path, title: str, sentences: Sequence[str]) -> Source:
         write_page(out, ("log",), content, scripts=not served)
         return False
 
-    identity = str(summary.get("identity") or checksum(file.read_bytes()))
-    return Source(identity, sentences, write)
+    return Source(str(summary.get("identity") or checksum(file.read_bytes())), sentences, write)
 
 
 def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
@@ -96,9 +95,8 @@ def _group(
 def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
     """The figures of a watch: each number by both observers."""
     for name, label in LABELS.items():
-        columns = {f"{side}.{name}": f"by the {side} observer" for side in POSITION_CHANNELS}
-        columns |= {f"{name}_{end}": f"{end}, with 95 %" for end in ("from", "to")}
-        lines = {column: f"{label} {origin}" for column, origin in columns.items()}
+        lines = {f"{side}.{name}": f"{label} by the {side} observer" for side in POSITION_CHANNELS}
+        lines |= {f"{name}_{end}": f"{label} {end}, with 95 %" for end in ("from", "to")}
         yield _group(frame, label, label, summary["units"]["motor"][name], lines)
 
 
@@ -153,11 +151,11 @@ def _first(summary: JsonObject, frame: DataFrame) -> list[str]:
 
 def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> Iterable[JsonObject]:
     """The figures of a log, the first two lines of each at the beginning."""
-    group = partial(_group, frame)
+    group, sides = partial(_group, frame), units.items()
     law, speed = ("true", "true") if "single_run" in summary else ("by the fitted law", "smoothed")
     bandwidths = summary.get("gap", {}).get("holdout", {}).get("bandwidth", {})
     last = summary["findings"][-1]["effect"] if summary.get("findings") else ""
-    for side, unit in units.items():
+    for side, unit in sides:
         quantity = f"missing {missing_quantity(_force(unit))}"
         lines = {
             f"{side}.missing_before": "model as given",
@@ -171,7 +169,7 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
                 lines[column] = f"with {effect} in place of {last}"
         lines[f"{side}.observed_before"] = "model as given, by the observer"
         yield group(f"{side}: {quantity}", quantity, _force(unit), lines, bandwidths.get(side))
-    for side, unit in units.items():
+    for side, unit in sides:
         for name, quantity, per, label in (
             ("residual", "position residual", "", "measured less the model's"),
             ("velocity_error", "velocity error", "/s", "true less observed"),
@@ -185,7 +183,7 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
         lines = {"u": "measured", "torque": "by the fitted law"}
     name = "torque in the transmission" if {"transmitted", "torque"} & {*frame} else "disturbance torque"
     yield group(name, missing_quantity(force), force, lines)
-    for side, unit in units.items():
+    for side, unit in sides:
         lines = {f"{side}.velocity": speed, f"{side}.velocity_estimate": "by the observer"}
         if f"{side}.velocity_estimate" in frame:
             yield group(f"{side}: speed", "speed", f"{unit}/s", lines)

@@ -85,8 +85,7 @@ def comparison_source(file: Path, _: str, sentences: Sequence[str]) -> Source:
 
 def _lead(result: StudyResult) -> list[str]:
     """The answer, and the study's notes; of a sweep at work no figures, which would be out of date on the page."""
-    manifest = result.source.manifest if isinstance(result.source, Store) else {"finished": True}
-    if manifest["finished"]:
+    if not isinstance(result.source, Store) or result.source.manifest["finished"]:
         return answer_sweep(result).sentences
     return ["This sweep is unfinished: the page shows the runs so far.", *result.config.notes]
 
@@ -131,14 +130,18 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> JsonObjec
     with points_writer(out, types) as write:
         for frame in result.batches():
             places = {path: frame[path].map(values.index) for path, values in words.items()}
-            metric_values = {name: page_values(frame, name) for name in metrics}
-            write(frame.assign(**places, **metric_values))
+            write(frame.assign(**places, **{name: page_values(frame, name) for name in metrics}))
             rows += len(frame)
     descriptions = [
         axis_words(config, axis.path) | {"words": words.get(axis.path), "log": axis.scale == "log"} for axis in config.axes
     ]
-    sampled = config.sweep.design != "grid"
-    return {"axes": descriptions, "rows": rows, "found": rows, "total": result.runs, "sampled": sampled}
+    return {
+        "axes": descriptions,
+        "rows": rows,
+        "found": rows,
+        "total": result.runs,
+        "sampled": config.sweep.design != "grid",
+    }
 
 
 _MOST_SAMPLES = 20_000
@@ -205,10 +208,9 @@ def nearby(config: Config, asked: Any) -> JsonObject:
     return {"metrics": run_perturbed(*point_of(config, asked), _NEARBY)}
 
 
-def _about(config: Config, columns: list[str], studies: Sequence[str] = ()) -> JsonObject:
+def _about(config: Config, columns: list[str], studies: Sequence[str]) -> JsonObject:
     """The page's account of a study and its columns."""
-    axes, experiment = {"seed", *config.axis_paths}, config.build()
-    names = [name for name in columns if name not in axes]
+    experiment, names = config.build(), [name for name in columns if name not in ("seed", *config.axis_paths)]
     return {
         "title": config.title or "Study",
         "metrics": [
