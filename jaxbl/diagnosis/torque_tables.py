@@ -190,7 +190,7 @@ class _Fit(NamedTuple):
 
     @classmethod
     def of(cls, matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> "_Fit":
-        second = block_diag(*(np.diff(np.eye(width), n=2, axis=0) for width in widths))
+        second = np.asarray(block_diag(*(np.diff(np.eye(width), n=2, axis=0) for width in widths)))
         penalty = (_RIDGE * np.eye(matrix.shape[1]) + stiffness * second.T @ second) * (np.mean(matrix**2) * len(target))
         regression = BlockRegression.of(target, matrix, BLOCKS, penalty)
         left_out = np.stack([regression.fit(np.flatnonzero(parts_of_blocks(QUARTERS) == part)) for part in range(QUARTERS)])
