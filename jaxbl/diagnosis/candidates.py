@@ -11,10 +11,9 @@ the only number is of that kind, the effect at a trial value is taken as it is, 
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,14 +28,12 @@ EffectNumbers = Mapping[str, Numbers]
 """Numbers of effects, by the name of each."""
 
 
-class Part(eqx.Module):
-    """A part of a record without gaps, and the model along it.
+class Part(Path):
+    """A part of a record without gaps, and the model along it; its torque is held from each sample to the next.
 
     Attributes:
-        time: s, shape (samples,).
-        torque: input, N m, held from each sample to the next.
-        readings: position over its smoothed value, rad, shape (samples, sides).
         position, velocity, acceleration: smoothed, of each side.
+        readings: position over its smoothed value, rad, shape (samples, sides).
         modelled: mean acceleration over the next period by the model, of each side: free of the readings' noise.
         deviation: standard deviation of the smoothed velocity, of each side.
         held: 1 where a side is not shown to move for a while, else 0.
@@ -45,15 +42,10 @@ class Part(eqx.Module):
         by_number: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
         defect: model's step less the smoothed one, shape (samples, states).
         weight: 1, or 0 where samples are padding.
-        before: input before the first sample, N m, shape (earlier,); None where that is not known.
     """
 
-    time: Samples
-    torque: Samples
-    readings: Float[Array, "samples sides"]
-    position: SideSamples
-    velocity: SideSamples
     acceleration: SideSamples
+    readings: Float[Array, "samples sides"]
     modelled: SideSamples
     deviation: SideSamples
     held: SideSamples
@@ -62,7 +54,6 @@ class Part(eqx.Module):
     by_number: Float[Array, "samples states numbers"]
     defect: Float[Array, "samples states"]
     weight: Samples
-    before: Float[Array, " earlier"] | None = None
 
 
 Torques = dict[int, np.ndarray]
@@ -105,14 +96,11 @@ def are_possible(effects: EffectNumbers, period: float) -> bool:
 
 
 def replaces(other: str, name: str) -> bool:
-    """Tell whether an effect gives way to another one: its special case, or of the same word at one place."""
-    return contains(other, name) or exclusive(other, [name])
-
-
-def exclusive(name: str, names: Iterable[str]) -> bool:
-    """Tell whether an effect cannot stand beside one that is there: of dry friction a side has one law."""
+    """Tell whether an effect gives way to another one: its special case, or of the same word at one place, as of dry
+    friction a side has one law."""
     word, place = EFFECTS[name].exclusive, name.partition(".")[0]
-    return word is not None and any(EFFECTS[other].exclusive == word and other.partition(".")[0] == place for other in names)
+    is_alike = word is not None and EFFECTS[other].exclusive == word and other.partition(".")[0] == place
+    return is_alike or contains(other, name)
 
 
 def contains(general: str, name: str) -> bool:
@@ -225,11 +213,6 @@ def _make_cached(name: str, *numbers: tuple[str, float]) -> AbstractEffect:
     return make_effect(name, **dict(numbers))
 
 
-def all_of_the_input() -> Candidate:
-    """The torque of the input once more."""
-    return Candidate("input", 1, (), lambda signals, _: {-1: signals.torque[None, : signals.samples]}, lambda values: {})
-
-
 class Forces:
     """Columns of torques side by side.
 
@@ -283,7 +266,6 @@ class MotionTorques:
         self.real = part.weight > 0.0
         # what is behind them only fills up
         self.samples = int(np.sum(self.real))
-        self.torque = part.torque
         # what torques along the motion need, of one shape whatever numbers are free
         self.moving = dataclasses.replace(part, step=None, force=None, by_number=None, defect=None)
         self.held = {side: (part.held[side] > 0.0) & self.real for side in self.sides}
@@ -306,10 +288,6 @@ class MotionTorques:
         holding = np.asarray(needed[side])
         level = max(float(np.quantile(np.abs(holding[held]), 0.95)), np.finfo(float).tiny)
         return np.where(held, np.clip(holding / level, -1.0, 1.0), moving)
-
-    def over(self, side: str) -> float:
-        """Torque on a side for 1 N m at the motor."""
-        return float(self.experiment.drive.ratio(side))
 
     def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[Torques]:
         """Torque that each effect adds, on top of what a model without it has. Before the first input known that one had
@@ -334,7 +312,7 @@ class MotionTorques:
             ]
             bare = with_effects(self.experiment, tuple(gear))
             # friction of the gear is on the motor's side; an effect on the input needs none
-            direction = self.direction.get("motor" if place == "transmission" else place, self.torque)
+            direction = self.direction.get("motor" if place == "transmission" else place, self.part.torque)
             for first in range(0, len(indices), _AT_ONCE):
                 batch = indices[first : first + _AT_ONCE]
                 # as many at once each time, so that one compiled program serves
@@ -377,11 +355,6 @@ def columns_of(candidates: Sequence[Candidate], signals: MotionTorques) -> list[
     return [signals.known[candidate] for candidate in candidates]
 
 
-def forces_of(candidates: Sequence[Candidate], signals: MotionTorques) -> Forces:
-    """Columns of candidates, one after the other."""
-    return Forces(columns_of(candidates, signals))
-
-
 @jit
 def _torques(
     experiment: Experiment, effects: AbstractEffect, part: Part, direction: jax.Array, from_rest: bool
@@ -389,18 +362,17 @@ def _torques(
     """Torques of effects of one name, leaves of shape (effects,), in a model that has those in the gear alone; shape
     (effects, samples) by side, -1 being the input."""
     drive, sides = experiment.drive, experiment.sides
-    along = Path(part.time, part.torque, part.position, part.velocity, before=part.before)
 
     def act(effect: AbstractEffect) -> dict[int, jax.Array]:
         place = drive.resolve_place(effect.place)
         if place == "transmission" and experiment.transmission is None:
             motion = Motion(part.time, part.position["motor"], part.velocity["motor"])
-            carried = experiment.plant.load_torque(effect_path(experiment, along)[0], motion)
+            carried = experiment.plant.load_torque(effect_path(experiment, part)[0], motion)
             return {0: -effect.gear_friction((), carried) * direction}
         if place == "transmission":
             models = (experiment, with_effects(experiment, (*experiment.effects, effect)))
             motion = part.position, part.velocity
-            states_of = [(model.plant, effect_path(model, along)[0]) for model in models]
+            states_of = [(model.plant, effect_path(model, part)[0]) for model in models]
             before, after = (plant.transmitted_torque(*motion, states) for plant, states in states_of)
             rubbed = [
                 plant.gear_friction(states, c) for (plant, states), (c, _) in zip(states_of, (before, after), strict=True)
@@ -409,7 +381,7 @@ def _torques(
                 0: before[0] - after[0] + (rubbed[0] - rubbed[1]) * direction,
                 1: after[1] * after[0] - before[1] * before[0],
             }
-        (state,), acting = effect_path(with_effects(experiment, (effect,)), along, from_rest)
+        (state,), acting = effect_path(with_effects(experiment, (effect,)), part, from_rest)
         if place == "actuator":
             return {-1: acting - part.torque}
         driving = part.torque if place == "motor" else 0.0
@@ -431,7 +403,7 @@ def _torques(
 def _find_needed(experiment: Experiment, part: Part) -> dict[str, jax.Array]:
     """Torque on each side that its motion does not take up, dry friction left out, N m."""
     plant = experiment.plant
-    states, torque = effect_path(experiment, Path(part.time, part.torque, part.position, part.velocity, before=part.before))
+    states, torque = effect_path(experiment, part)
     acting = plant.side_torques(part.position, part.velocity, states, torque, part.time)
     torques = {}
     for side in experiment.sides:

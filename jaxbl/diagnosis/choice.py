@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 
 from .blocks import standard_errors_better
 from .confidence import Finding, missing_power, weigh
-from .effect_search import EffectSearch, Explanation, VerdictName
+from .effect_search import EffectSearch, Explanation, Trial, VerdictName
 from .expected_errors import expected_errors, list_failed
 from .fitted_model import FittedModel
 from .history import Step
@@ -27,18 +27,6 @@ from .thresholds import LIMITS
 from .torque_tables import Tabulation, tabulate
 
 
-class Rival(NamedTuple):
-    """The best model with another effect in place of one that was found.
-
-    Attributes:
-        effect: the other one.
-        fitted: the model with it.
-    """
-
-    effect: str
-    fitted: FittedModel
-
-
 class Chosen(NamedTuple):
     """The model that stands.
 
@@ -47,7 +35,7 @@ class Chosen(NamedTuple):
         fitted: the model with it.
         compared: how it compares on the log, each quarter by numbers fitted without it.
         findings: its effects, and how sure they are.
-        rival: the best model with another effect, or None.
+        rival: the best model with another effect in place of one that was found, or None.
         driving: torque that drives the machine, rms, N m.
         prior: standard deviation of theta of the model's own numbers.
         numbers_off: whether that is more than is stated of them.
@@ -57,7 +45,7 @@ class Chosen(NamedTuple):
     fitted: FittedModel
     compared: Comparison
     findings: tuple[Finding, ...]
-    rival: Rival | None
+    rival: Trial | None
     driving: float
     prior: np.ndarray
     numbers_off: bool
@@ -122,7 +110,10 @@ class Choice:
         fitted, compared = explanation.fitted, self.search.compare(explanation.fitted)
         if not fitted.names and not standard_errors_better(self.log, self.before, compared) > LIMITS.difference:
             fitted, compared = self._as_given(fitted), self.before
-        fits, closest = self.search.fits, _closest(explanation)
+        fits = self.search.fits
+        # the rival over which the effect in whose place it stands gains least
+        trials_of_all = [trial for trials in explanation.rivals.values() for trial in trials if np.isfinite(trial.gain.nats)]
+        closest = min(trials_of_all, key=lambda trial: trial.gain.nats, default=None)
         numbers_off = fits is self.search.rough and fitted is explanation.fitted
         return Chosen(explanation, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
@@ -172,10 +163,3 @@ class Choice:
         return fitted._replace(
             experiment=self.setup.nominal, theta=0.0 * fitted.theta, covariance=covariance, white=off, left_out=None
         )
-
-
-def _closest(explanation: Explanation) -> Rival | None:
-    """Find the rival over which the effect in whose place it stands gains least."""
-    trials_of_all = [trial for trials in explanation.rivals.values() for trial in trials if np.isfinite(trial.gain.nats)]
-    best = min(trials_of_all, key=lambda trial: trial.gain.nats, default=None)
-    return None if best is None else Rival(best.added[0], best.fitted)

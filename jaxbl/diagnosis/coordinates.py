@@ -3,8 +3,8 @@
 # arrays of numpy go where those of jax are asked for
 # pyright: reportArgumentType=false
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -62,8 +62,7 @@ def coordinates_of(
     part, side = segment.kinematics, residual.name
     length, omega = ("m", "v") if side in sliding else ("rad", "ω")
     velocity = part.velocity[side]
-    deviation = segment.smoothed[side].deviation(1)
-    still = np.abs(velocity) <= np.maximum(_STILL * deviation, _STILL_SHARE * rms(velocity))
+    still = np.abs(velocity) <= np.maximum(_STILL * segment.smoothed[side].deviation(1), _STILL_SHARE * rms(velocity))
 
     def position_of(place: str) -> CoordinateValues:
         unit, symbol = ("m", "x") if place in sliding else ("rad", _ANGLES[place])
@@ -91,7 +90,7 @@ def coordinates_of(
         coordinates["load position"] = position_of("load")
     unit, force = ("m", "N") if "motor" in sliding else ("rad", "N m")
     if geared:
-        twist, rate = (_twist(experiment, motion) for motion in (part.position, part.velocity))
+        twist, rate = (np.asarray(experiment.plant.twist(motion)) for motion in (part.position, part.velocity))
         coordinates["twist"] = CoordinateValues(twist, unit, "z")
         coordinates["twist rate"] = CoordinateValues(rate, f"{unit}/s", "ż")
     if side == "motor":
@@ -110,10 +109,7 @@ def within_turn(position: np.ndarray) -> np.ndarray | None:
 
 
 def all_coordinates(
-    experiment: Experiment,
-    segments: Sequence[Segment],
-    residuals: SideResiduals,
-    sliding: Collection[str],
+    experiment: Experiment, segments: Sequence[Segment], residuals: SideResiduals, sliding: Collection[str]
 ) -> SideCoordinates:
     """Those of each side's residuals (:func:`coordinates_of`), segment by segment."""
     return {
@@ -125,17 +121,12 @@ def all_coordinates(
     }
 
 
-def _twist(experiment: Experiment, values: Mapping[str, Any]) -> np.ndarray:
-    """Twist by the positions, rad, or its rate by the velocities."""
-    return values["motor"] - float(experiment.drive.ratio("load")) * values["load"]
-
-
 def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, CoordinateValues]:
     """On which side of the gap the transmission is, and which way it is loaded."""
     classes, plant = {}, experiment.plant
     torque = np.asarray(find_transmitted(experiment, part) if part.transmitted is None else part.transmitted)
     if plant.half_gap > 0.0:
-        twist = _twist(experiment, part.position)
+        twist = np.asarray(plant.twist(part.position))
         inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
         classes["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
     idle = np.abs(torque) < _IDLE * rms(torque)

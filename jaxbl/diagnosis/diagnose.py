@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import pandas as pd
 
-from jaxbl.chain import Experiment
 from jaxbl.config import Config, ConfigSource
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
@@ -155,7 +154,9 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         announce("running the observers")
         missing = _missing(setup, proof, chosen, lacking_after)
         observing = set_leaves(setup.bare, arrays(gain_values))
-        observed = _run_observers(setup, proof, observing)
+        # nothing is decided by them
+        unseen = {} if task.separate else observed_torques(at_period(observing, proof.log.period), proof.log.segments)
+        observed = observed_torques(observing, setup.fitted.segments), unseen
         trace = trace_of(setup, proof, missing, observed)
         done()
         summary = summary_of(setup, chosen, choice.search.history) | {"verdict": judgement.verdict, "explained_share": share}
@@ -164,7 +165,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             summary["where"][side]["observed"] = witness
         summary["feedback"] = find_feedback_bias(task.record, setup.fitted.segments, fitted.experiment)
         summary["notes"] += [there["sentence"] for there in summary["feedback"].values()] + notes
-        summary["contradictions"] = contradictions_of(task.record, fitted, apart)
+        summary["contradictions"] = contradictions_of(task.record, apart)
         summary["gap"] = proof.gap | summarise_test(judgement, proof)
         if judgement.verdict == "unknown_effect":
             segments = setup.fitted.segments
@@ -200,7 +201,7 @@ def _missing(
     fitted = chosen.fitted
     reduced = {f"missing_without.{name}": without(fitted.experiment, name) for name in fitted.names}
     if chosen.rival is not None:
-        reduced[f"missing_with.{chosen.rival.effect}"] = chosen.rival.fitted.experiment
+        reduced[f"missing_with.{chosen.rival.added[0]}"] = chosen.rival.fitted.experiment
     after = lacking_after, proof.after.torques
     missing = {"missing_before": (setup.lacking, proof.before.torques), "missing_after": after}
     for name, experiment in reduced.items():
@@ -226,11 +227,3 @@ def _check_input_shown(setup: Setup, deviations: float) -> None:
         f"{100.0 * least:.0f} % of the input would be seen; noise {least / LIMITS.effect_size:.2g} times smaller, or "
         "torques as many times larger, are needed"
     )
-
-
-def _run_observers(setup: Setup, proof: Proof, nominal: Experiment) -> tuple[SideObserved, SideObserved]:
-    """Run the observers on the log, and on what was held out of it; nothing is decided by it."""
-    held_out = {}
-    if not setup.task.separate:
-        held_out = observed_torques(at_period(nominal, proof.log.period), proof.log.segments)
-    return observed_torques(nominal, setup.fitted.segments), held_out

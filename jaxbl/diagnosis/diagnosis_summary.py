@@ -22,10 +22,10 @@ from jaxbl.quantity import Quantity
 from jaxbl.records import POSITION_CHANNELS, Record
 
 from .candidates import EffectNumbers, are_possible
-from .choice import Chosen, Rival
+from .choice import Chosen
 from .confidence import Finding
 from .diagnosis_task import input_rms
-from .fitted_model import FittedModel
+from .effect_search import Trial
 from .history import Step, describe_history
 from .judgement import Judgement
 from .localise import Localised
@@ -92,10 +92,7 @@ def describe_parameters(record: Record, free: Sequence[FreeParameter], values: N
     """Describe the model's own numbers, by path, as in `diagnosis.json`; values and standard errors by path."""
     return {
         number.path: Quantity(
-            values[number.path],
-            errors[number.path],
-            unit=record.unit_of(number.path, number.unit),
-            nominal=number.nominal,
+            values[number.path], errors[number.path], unit=record.unit_of(number.path, number.unit), nominal=number.nominal
         ).to_dict()
         for number in free
     }
@@ -139,13 +136,12 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
     }
 
 
-def contradictions_of(record: Record, fitted: FittedModel, contradictions: Sequence[Contradiction]) -> list[JsonObject]:
+def contradictions_of(record: Record, contradictions: Sequence[Contradiction]) -> list[JsonObject]:
     """Numbers that two logs show to be different, in the log's units."""
-    units = {number.path: record.unit_of(number.path, number.unit) for number in fitted.free}
     return [
         {
             "parameter": contradiction.path,
-            "unit": units[contradiction.path],
+            "unit": record.unit_of(contradiction.path, contradiction.unit),
             "logs": [
                 {"log": value.log} | Quantity(value.value, value.error).to_dict()
                 for value in (contradiction.least, contradiction.most)
@@ -183,11 +179,7 @@ def describe_observers(nominal: Experiment, observed: SideObserved, setup: Setup
 
 
 def extended_study(
-    config: Config,
-    numbers: EffectNumbers,
-    values: Numbers,
-    record: Record,
-    tables: Sequence[JsonObject] = (),
+    config: Config, numbers: EffectNumbers, values: Numbers, record: Record, tables: Sequence[JsonObject] = ()
 ) -> Config:
     """The study with effects more, some of them tables of torques, and with these numbers; at the log's period where
     effects cannot be simulated at its own (a dead time of more samples than a model remembers)."""
@@ -202,19 +194,19 @@ def extended_study(
 def find_tie(summary: JsonObject) -> tuple[str, str] | None:
     """The finding that the rival stands for, and the rival; None where nothing is tied."""
     other = summary.get("rival", {}).get("effect")
-    names = (
-        finding["effect"]
+    ties = (
+        (finding["effect"], other)
         for finding in summary["findings"]
         if other in [rival["effect"] for rival in finding["alternatives"]]
     )
-    name = next(names, None)
-    return None if name is None else (name, other)
+    return next(ties, None)
 
 
-def rival_tables(config: Config, record: Record, free: Sequence[FreeParameter], rival: Rival) -> JsonObject:
+def rival_tables(config: Config, record: Record, free: Sequence[FreeParameter], rival: Trial) -> JsonObject:
     """The best model with another effect, as tables of a study."""
     data = extended_study(config, rival.fitted.numbers, free_values(free, rival.fitted.theta), record).to_dict()
-    return {"effect": rival.effect} | {key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data}
+    tables = {key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data}
+    return {"effect": rival.added[0]} | tables
 
 
 def trace_of(

@@ -58,7 +58,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
 def input_rms(record: Record) -> float:
     """Return the rms of the input on all segments of a log, N m."""
     assert record.torque is not None
-    return rms(np.concatenate([record.torque[part] for part in record.segments]))
+    return rms(record.torque[_list_rows(record)])
 
 
 def _long(record: Record) -> Record:
@@ -121,14 +121,13 @@ def _check_machine(record: Record, other: Record) -> None:
             f"{other.path}: theta_e moves {ratios[1]:.4g} for each 1 of theta_s, on {record.path} {ratios[0]:.4g}; it "
             "is of another machine, or a sign or unit differs"
         )
-    inertias = []
-    for dynamics in (record.statistics.dynamics, other.statistics.dynamics):
-        if (
-            dynamics is not None
-            and dynamics.shares[0] > _SHOWN
-            and _KNOWN * dynamics.errors[0] * dynamics.inflation[0] < abs(dynamics.values[0])
-        ):
-            inertias.append(float(dynamics.values[0]))
+    inertias = [
+        float(dynamics.values[0])
+        for dynamics in (record.statistics.dynamics, other.statistics.dynamics)
+        if dynamics is not None
+        and dynamics.shares[0] > _SHOWN
+        and _KNOWN * dynamics.errors[0] * dynamics.inflation[0] < abs(dynamics.values[0])
+    ]
     if len(inertias) == 2 and not 1.0 / _ALIKE < inertias[1] / inertias[0] < _ALIKE:
         raise InputError(
             f"{other.path}: shows an inertia of {inertias[1]:.3g}, {record.path} of {inertias[0]:.3g} at the motor; it is "

@@ -111,8 +111,7 @@ class _Proposal(NamedTuple):
     variant: Candidate | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class Explanation:
+class Explanation(NamedTuple):
     """The effects that a model lacks by a log.
 
     Attributes:
@@ -270,7 +269,7 @@ class EffectSearch:
     def leave_out(self, explanation: Explanation, name: str) -> Explanation:
         """Explain a log without an effect that was found, and is less likely than something unknown in its place."""
         current = explanation.fitted
-        less = self._refit(current, {other: numbers for other, numbers in current.numbers.items() if other != name})
+        less = self._refit(current, _drop_effects(current.numbers, [name]))
         reason = "something unknown is likelier in its place"
         self._note(f"leave out {name}", explanation.gains[name], True, reason, loss=True)
         explanation = self._conclude(*self._reduce(less, thorough=True))
@@ -368,8 +367,8 @@ class EffectSearch:
             return Trial(tuple(new), fitted, self.gain(current, fitted))
         if old.keys() & gone:
             # it stood for the new ones: they are compared with the model that has neither
-            current = self._refit(current, {name: old[name] for name in old if name not in gone})
-        return self._try(current, proposal._replace(numbers={name: new[name] for name in new if name not in gone}))
+            current = self._refit(current, _drop_effects(old, gone))
+        return self._try(current, proposal._replace(numbers=_drop_effects(new, gone)))
 
     def _refit(self, current: FittedModel, numbers: EffectNumbers, *added: str) -> FittedModel:
         """Fit a model with other effects, from the own numbers of one; `added`: those that are new there."""
@@ -387,8 +386,7 @@ class EffectSearch:
                 certain = name in self.expected
                 fewer = None if certain else self._simplify(current, name)
                 if fewer is None and thorough:
-                    numbers = {other: values for other, values in current.numbers.items() if other != name}
-                    less = self._refit(current, numbers)
+                    less = self._refit(current, _drop_effects(current.numbers, [name]))
                     gains[name] = self.gain(less, current)
                     stays = certain or gains[name].is_accepted
                     self._note(f"remove {name}", gains[name], not stays, gains[name].rule, loss=True)
@@ -437,7 +435,7 @@ class EffectSearch:
             (other, *more) = trial.added
             if more or other in current.names or contains(other, name) or contains(name, other):
                 continue
-            numbers = {effect: values for effect, values in current.numbers.items() if effect != name}
+            numbers = _drop_effects(current.numbers, [name])
             if any(replaces(effect, other) or replaces(other, effect) for effect in numbers):
                 continue
             fitted = self._refit(current, {**numbers, other: trial.fitted.numbers[other]}, other)
@@ -492,14 +490,13 @@ class EffectSearch:
         if ranked:
             # a predictor chosen without an effect makes up for it
             leaders = [linear.choose([proposal.variant]) for proposal in ranked[:_LEADERS] if proposal.variant is not None]
-            predictor = min(leaders, key=lambda leader: np.sum(np.log(leader.deviation)))
+            predictor = min(leaders, key=lambda leader: leader.log_square)
             ranked = self._rank(linear, current.names, variants, predictor)
         promised = {next(iter(proposal.numbers)): proposal for proposal in ranked[:_PROPOSED]}
         by_torque = regression.propose()[:_BY_TORQUE]
         additional = [
             effect for effect in by_torque if effect.name not in promised and effect.share > _PROMISING * by_torque[0].share
         ]
-        shares = {effect.name: effect.share for effect in additional}
         proposals = [
             proposal
             for name, proposal in promised.items()
@@ -511,7 +508,7 @@ class EffectSearch:
         proposals += [
             _Proposal({effect.name: effect.numbers})
             for effect in additional
-            if not any(contains(effect.name, other) and effect.share < share + SHOWN for other, share in shares.items())
+            if not any(contains(effect.name, other.name) and effect.share < other.share + SHOWN for other in additional)
         ]
         together = regression.propose_together()
         if len(together) > 1:
@@ -573,6 +570,11 @@ class EffectSearch:
                     best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
             gained[function.name] = best
         return gained
+
+
+def _drop_effects(numbers: EffectNumbers, names: Collection[str]) -> EffectNumbers:
+    """Leave out the numbers of some effects."""
+    return {name: values for name, values in numbers.items() if name not in names}
 
 
 def _waves(name: str) -> list[str]:

@@ -65,14 +65,14 @@ def evidence_of(columns: Products, variants: Sequence[Candidate] = (), index: in
     A candidate that is linear about a value that was tried is left at this value where it would have to go too far.
     """
     if index is None:
-        return _evidence(columns, (), None, None)
+        return _evidence(columns, (), -1, None)
     places, offset = columns.places[index], columns.offsets[index]
     evidence = _evidence(columns, places, offset, variants[index])
     return _evidence(columns, (), offset, variants[index]) if evidence is None and offset >= 0 else evidence
 
 
-def _evidence(c: Products, places: Sequence[int], offset: int | None, candidate: Candidate | None) -> Evidence | None:
-    fixed = np.array([0] if offset is None or offset < 0 else [0, offset])
+def _evidence(c: Products, places: Sequence[int], offset: int, candidate: Candidate | None) -> Evidence | None:
+    fixed = np.array([0] if offset < 0 else [0, offset])
     # what has no torque along this record has no coefficient either
     alive = [k for k in (*range(1, 1 + c.own_count), *places) if np.isfinite(c.scale[k])]
     variance, middle = c.scale**2, c.centre.copy()

@@ -87,14 +87,10 @@ class FittedModel(NamedTuple):
             name: {leaf: float(get_leaf(effect, leaf)) for leaf in leaf_paths(effect)} for name, effect in effects.items()
         }
 
-    @property
-    def deviation(self) -> np.ndarray:
-        """Standard deviation of theta."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-
     def errors(self) -> Numbers:
         """Standard errors of the values."""
-        return {number.path: float(number.slope(self.theta[i])) * self.deviation[i] for i, number in enumerate(self.free)}
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return {number.path: float(number.slope(self.theta[i])) * deviation[i] for i, number in enumerate(self.free)}
 
     def move_by(self, change: np.ndarray) -> Experiment:
         """The model with a change of theta, to first order: a number that the log hardly shows may change by several times

@@ -41,9 +41,7 @@ class Run(NamedTuple):
 
 # of a model that diverges nothing is finite
 @np.errstate(invalid="ignore", over="ignore")
-def best_runs(
-    experiment: Experiment, windows: Windows, passes: int, at_rest: bool, indices: np.ndarray | None = None
-) -> Run:
+def best_runs(experiment: Experiment, windows: Windows, passes: int, at_rest: bool, indices: np.ndarray) -> Run:
     """Runs from the initial states that suit the first fifth of each window best.
 
     Args:
@@ -51,7 +49,7 @@ def best_runs(
         windows: without weights.
         passes: initial states that are tried for a window at most.
         at_rest: whether standstill is one of them.
-        indices: of the windows that are run; left out: all.
+        indices: of the windows that are run.
     """
     windows = jax.tree.map(np.asarray, windows)
     experiment, start = lean(experiment, windows.start)
@@ -59,8 +57,7 @@ def best_runs(
     # what was before a window is known where it goes on where another one ends
     steps = np.rint(np.diff(windows.time) / float(experiment.run.sample_period))
     within = np.concatenate([[False], steps == windows.torque.shape[1]]) | windows.at_rest
-    if indices is not None:
-        windows, within = windows.only(indices), within[indices]
+    windows, within = windows.only(indices), within[indices]
     if not len(within):
         states = jax.tree.map(lambda _: windows.torque, start)
         return Run(windows.finer, states, np.zeros(len(experiment.sides)))

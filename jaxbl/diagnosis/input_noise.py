@@ -85,7 +85,7 @@ def _penalty(count: int) -> np.ndarray:
     """Products of third differences, as lower bands."""
     stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
     bands = np.zeros((_ORDER + 1, count))
-    for start in range(_ORDER + 1):
-        for other in range(start, _ORDER + 1):
-            bands[other - start, start : start + count - _ORDER] += stencil[start] * stencil[other]
+    for apart in range(_ORDER + 1):
+        products = stencil[apart:] * stencil[: len(stencil) - apart]
+        bands[apart, : count - apart] = np.convolve(np.ones(count - _ORDER), products)
     return bands

@@ -40,7 +40,7 @@ from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.records.least_squares import rms
 from jaxbl.workers import map_in_threads
 
-from .candidates import REACH, SPACING, Candidate, Forces, MotionTorques, Part, all_of_the_input, forces_of
+from .candidates import REACH, SPACING, Candidate, Forces, MotionTorques, Part, columns_of
 from .evidence import Products
 from .neutral_effects import bucket, find_corrected, lean, with_torques
 from .thresholds import LIMITS
@@ -78,7 +78,13 @@ def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarr
         # what is known has no error that a predictor could have
         order += [] if effect.state_from_input else range(state_count, state_count + states_of)
         state_count += states_of
-    ways = _directions(free, theta, state_count, order, list(added.values()))
+    # each state, torque on each side, input, each free number
+    ways = [
+        *(Direction(state=row) for row in np.eye(state_count)[order].tolist()),
+        *(Direction({path: -1.0}) for path in added.values()),
+        Direction(torque=1.0),
+        *(Direction({number.path: float(number.slope(now))}) for number, now in zip(free, theta, strict=True)),
+    ]
     slope, value = step_derivatives(experiment, motion, torque, time, ways)
     slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
@@ -91,21 +97,9 @@ def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarr
     a, b, by_number = np.split(slope, (len(order), len(order) + side_count + 1), axis=2)
     weight = (np.arange(size) < count).astype(float)
     return Part(
-        time, torque, read, position, velocity, acceleration, modelled, deviation, held, a, b, by_number, defect, weight,
-        segment.before,
+        time, torque, position, velocity, acceleration, read, modelled, deviation, held, a, b, by_number, defect, weight,
+        before=segment.before,
     )  # fmt: skip
-
-
-def _directions(
-    free: Sequence[FreeParameter], theta: np.ndarray, states: int, order: Sequence[int], added: Sequence[str]
-) -> list[Direction]:
-    """Each state, torque on each side (`added`: their paths), input, each free number."""
-    return [
-        *(Direction(state=row) for row in np.eye(states)[list(order)].tolist()),
-        *(Direction({path: -1.0}) for path in added),
-        Direction(torque=1.0),
-        *(Direction({number.path: float(number.slope(value))}) for number, value in zip(free, theta, strict=True)),
-    ]
 
 
 class _Columns:
@@ -229,10 +223,9 @@ class Predictor:
     """
 
     def __init__(self, linear: "Linear", smoothness: list[float], grams: Arrays):
-        self.smoothness, self.count = smoothness, linear.count
-        own_states = linear.states - 2 * len(linear.sides)
-        self.given = np.sum([_as_it_stands(gram, own_states) for gram in grams], axis=0)
+        self.smoothness, self.count, self.theta, self.prior = smoothness, linear.count, linear.theta, linear.prior
         sides, own_count, states, count = len(linear.sides), len(linear.free), linear.states, linear.count
+        self.given = np.sum([_as_it_stands(gram, states - 2 * sides) for gram in grams], axis=0)
         width = grams[0].shape[1] - 1 - states
         # of a gain under which errors diverge, or all but: what is left is smaller than the rounding of their products
         self.squares, self.coefficients = np.full(sides, np.inf), [np.zeros(gram.shape[1]) for gram in grams]
@@ -240,7 +233,7 @@ class Predictor:
             return
         weight = np.ones(sides)
         prior, centre = np.full(width, np.inf), np.zeros(width)
-        prior[:own_count], centre[:own_count] = linear.prior, -linear.theta
+        prior[:own_count], centre[:own_count] = self.prior, -self.theta
         for turn in range(2):
             weighted = [np.einsum("s,scd->cd", weight, gram) for gram in grams]
             responses = [_response_and_loss(gram, states) for gram in weighted]
@@ -264,10 +257,16 @@ class Predictor:
     def deviation(self) -> np.ndarray:
         return np.sqrt(self.squares / self.count)
 
-    def cost(self, theta: np.ndarray, width: np.ndarray) -> float:
+    @property
+    def log_square(self) -> float:
+        """Sum of the logarithms of the squares; infinite where the errors of a side diverge."""
+        return float(np.sum(np.log(self.squares)))
+
+    @property
+    def promise(self) -> float:
         """Minus twice the log-likelihood, with the prior's, that a step from theta promises."""
-        moved = theta + self.coefficients[0][1 : 1 + len(theta)]
-        return float(self.count * np.sum(np.log(self.squares)) + np.sum((moved / width) ** 2))
+        moved = self.theta + self.coefficients[0][1 : 1 + len(self.theta)]
+        return self.count * self.log_square + float(np.sum((moved / self.prior) ** 2))
 
 
 @jit
@@ -313,7 +312,7 @@ class Linear:
         self.signals = [
             MotionTorques(self.experiment, part, segment.torques) for part, segment in zip(self.parts, segments, strict=True)
         ]
-        self.count = sum(int(signals.real.sum()) for signals in self.signals)
+        self.count = sum(signals.samples for signals in self.signals)
         self.states = self.parts[0].defect.shape[1]
         self.input_gain = float(_figures(self.experiment)[0])
         self.drive, self.driven = find_driving_torque(self.experiment, segments)
@@ -333,11 +332,9 @@ class Linear:
         return scales
 
     def _scales_at(self, place: str) -> Scales:
-        if place not in self._scales:
-            self._scales[place] = self._measure_scales(place)
-        return self._scales[place]
+        if place in self._scales:
+            return self._scales[place]
 
-    def _measure_scales(self, place: str) -> Scales:
         def join(of) -> np.ndarray:
             return np.concatenate([of(signals.part)[signals.real] for signals in self.signals])
 
@@ -346,7 +343,7 @@ class Linear:
         ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
         if len(self.sides) == 2:
             twist = join(lambda part: part.position["motor"] - ratio * part.position["load"])
-        return Scales(
+        self._scales[place] = Scales(
             torque=float(np.max(np.abs(join(lambda part: part.torque)))),
             period=self.period,
             duration=self.count * self.period,
@@ -360,13 +357,14 @@ class Linear:
             harmonics=self._harmonics(side),
             wave_count=self._wave_count(side),
         )
+        return self._scales[place]
 
     def _harmonics(self, side: str) -> tuple[float, ...]:
         """Periods a turn of the waves that effects on a side have."""
         harmonics: list[float] = []
         for effect in self.experiment.effects:
             roles = type(effect).roles()
-            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf, role in roles.items() if role.kind == "size")
+            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf in effect.sizes())
             if acts and self.experiment.drive.resolve_place(effect.place) == side:
                 harmonics += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
         return tuple(harmonics)
@@ -387,14 +385,6 @@ class Linear:
         """Frequency up to which a disturbance is sought, Hz: half of what the samples show, and what a drive passes on."""
         return min(0.25 / self.period, _HIGHEST)
 
-    @staticmethod
-    def gain_of(smoothness: Sequence[float], period: float) -> np.ndarray:
-        """Steady-state gains of both sides, shape (sides, 2)."""
-        return np.stack([kalman_gain(q, period) for q in smoothness])
-
-    def gain(self, smoothness: Sequence[float]) -> np.ndarray:
-        return self.gain_of(smoothness, self.period)
-
     def predictor(self, smoothness: Sequence[float]) -> Predictor:
         """Prediction errors under a given gain."""
         (predictor,) = self._predictors([list(smoothness)], [Forces(())] * len(self.parts))
@@ -402,7 +392,7 @@ class Linear:
 
     def errors(self, smoothness: Sequence[float]) -> Arrays:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
-        return [_errors(part, self.gain(smoothness), Forces(())) for part in self.parts]
+        return [_errors(part, find_gains(smoothness, self.period), Forces(())) for part in self.parts]
 
     def choose(self, variants: Sequence[Candidate], near: Sequence[float] | None = None) -> Predictor:
         """The predictor with the least errors, some candidates taken in; the search begins at a smoothness of each side."""
@@ -414,29 +404,17 @@ class Linear:
 
     def _search(self, variants: Sequence[Candidate], near: Sequence[float] | None) -> tuple[Predictor, list[Forces]]:
         """The predictor with the least errors, and the candidates' torques."""
-        forces = [forces_of(variants, signals) for signals in self.signals]
-
-        def best(options: list[list[float]]) -> Predictor:
-            predictors = self._predictors(options, forces)
-            costs = [
-                np.sum(np.log(predictor.squares)) if (predictor.squares > 0.0).all() else np.inf for predictor in predictors
-            ]
-            return predictors[int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))]
-
-        if near is None:
-            chosen = best([[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS])
-        else:
-            (chosen,) = self._predictors([list(near)], forces)
+        forces = [Forces(columns_of(variants, signals)) for signals in self.signals]
+        begin = [[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS] if near is None else [list(near)]
+        chosen = min(self._predictors(begin, forces), key=lambda predictor: predictor.log_square)
         for i in range(len(self.sides)) if len(self.sides) > 1 or near is not None else ():
             now, least = chosen.smoothness, _COARSE_SMOOTHNESS[0]
             options = [[max(float(q * f), least) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
-            other = best(options)
-            if np.sum(np.log(other.squares)) < np.sum(np.log(chosen.squares)):
-                chosen = other
+            chosen = min(chosen, *self._predictors(options, forces), key=lambda predictor: predictor.log_square)
         return chosen, forces
 
     def _predictors(self, options: list[list[float]], forces: list[Forces]) -> list[Predictor]:
-        gains = [self.gain(smoothness) for smoothness in options]
+        gains = [find_gains(smoothness, self.period) for smoothness in options]
         grams = [_grams(part, gains, force) for part, force in zip(self.parts, forces, strict=True)]
         return [Predictor(self, smoothness, [gram[i] for gram in grams]) for i, smoothness in enumerate(options)]
 
@@ -478,7 +456,7 @@ class Linear:
         assert self._last is not None
         part, side = self.parts[i], self.sides.index(place)
         predictor, forces = self._last
-        gain, deviation = self.gain(predictor.smoothness), predictor.deviation
+        gain, deviation = find_gains(predictor.smoothness, self.period), predictor.deviation
         if not np.isfinite(deviation).all():
             # no predictor follows this model
             return np.zeros(self.signals[i].samples), np.ones(len(few))
@@ -499,8 +477,9 @@ class Linear:
         """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
         eliminated; `noise`: rms of the errors by side, rad. Products of different
         candidates are there for some only."""
-        gain, own_count, groups = self.gain(smoothness), len(self.free), _groups(variants)
-        places, offsets, end = [], [], 1 + own_count
+        # the constant and the own numbers come first
+        gain, shared, groups = find_gains(smoothness, self.period), 1 + len(self.free), _groups(variants)
+        places, offsets, end = [], [], shared
         for variant in variants:
             places.append(tuple(range(end, end + variant.width)))
             end += variant.width
@@ -511,30 +490,30 @@ class Linear:
             gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
             return _eliminate(gram, self.states), self._power(forces, signals)
 
-        jobs = [(signals, forces_of(group, signals)) for signals in self.signals for group in groups]
+        jobs = [(signals, Forces(columns_of(group, signals))) for signals in self.signals for group in groups]
         total, power = np.zeros((end, end)), np.zeros(end)
-        first = 1 + own_count
+        first = shared
         for gram, squares in map_in_threads(products, *zip(*jobs, strict=True)):
             last = first + len(squares)
-            index = np.array([*range(1 + own_count), *range(first, last)])
-            if first > 1 + own_count:
+            index = np.array([*range(shared), *range(first, last)])
+            if first > shared:
                 # what all candidates of a part share counts once
-                gram[: 1 + own_count, : 1 + own_count] = 0.0
+                gram[:shared, :shared] = 0.0
             total[np.ix_(index, index)] += gram
             power[first:last] += squares
-            first = last if last < end else 1 + own_count
+            first = last if last < end else shared
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
-            size = LIMITS.effect_size * self.drive / np.sqrt(power[1 + own_count :] / self.count)
+            size = LIMITS.effect_size * self.drive / np.sqrt(power[shared:] / self.count)
         scale = np.concatenate([[np.inf], self.prior, size])
-        for variant, place in zip(variants, places, strict=True):
+        for variant, place in zip(variants, map(list, places), strict=True):
             if variant.offset or variant.spread:
-                scale[list(place)] = variant.spread or SPACING
+                scale[place] = variant.spread or SPACING
             elif (nominal := self.nominal(variant.name)) is not None:
-                scale[list(place)] = np.minimum(scale[list(place)], LIMITS.number_error * nominal)
+                scale[place] = np.minimum(scale[place], LIMITS.number_error * nominal)
         centre = np.zeros(end)
-        centre[1 : 1 + own_count] = -self.theta
-        return Products(total, own_count, tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
+        centre[1:shared] = -self.theta
+        return Products(total, len(self.free), tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
 
     def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
         """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
@@ -551,7 +530,7 @@ class Linear:
 
     def _power(self, torques: Forces, signals: MotionTorques) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
-        over = {i: signals.over(side) for i, side in enumerate(self.sides)}
+        over = {i: float(self.experiment.drive.ratio(side)) for i, side in enumerate(self.sides)}
         return torques.squares(over | {-1: 1.0 / self.input_gain})
 
     def find_input_significance(self) -> float:
@@ -559,7 +538,11 @@ class Linear:
         if not self.driven:
             return np.inf
         predictor = self.choose(())
-        products = self.columns([all_of_the_input()], predictor.smoothness, predictor.deviation).products
+        # the torque of the input once more
+        again = Candidate(
+            "input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]}, lambda values: {}
+        )
+        products = self.columns([again], predictor.smoothness, predictor.deviation).products
         return float(np.sqrt(products[-1, -1]))
 
     def shows(self, name: str, numbers: Numbers) -> bool:
@@ -573,8 +556,8 @@ class Linear:
         """Torque of an effect along the log, less that of a plain law of it, rms over the driving torque's."""
         power = 0.0
         for signals in self.signals:
-            torques, *others = signals.of([effect, *plain])
-            apart = {place: torque - sum(other.get(place, 0.0) for other in others) for place, torque in torques.items()}
+            torques, *plain_torques = signals.of([effect, *plain])
+            apart = {place: torque - sum(law.get(place, 0.0) for law in plain_torques) for place, torque in torques.items()}
             power += self._power(Forces([apart]), signals)[0]
         return float(np.sqrt(power / self.count)) / self.drive
 
@@ -606,6 +589,11 @@ def _peaks(
     return peaks_found
 
 
+def find_gains(smoothness: Sequence[float], period: float) -> np.ndarray:
+    """Find the steady-state gains of both sides, shape (sides, 2)."""
+    return np.stack([kalman_gain(q, period) for q in smoothness])
+
+
 def _groups(variants: Sequence[Candidate]) -> list[list[Candidate]]:
     """Neighbours whose columns are taken through the recursion together; one empty group if there are none."""
     groups: list[list[Candidate]] = [[]]
@@ -624,14 +612,6 @@ def _least_squares(total: np.ndarray, precision: np.ndarray, centre: np.ndarray)
     return -np.linalg.lstsq(matrix / np.outer(size, size), towards / size, rcond=1e-12)[0] / size
 
 
-def _influence(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
-    """Products of the last columns, the initial states, over their sizes; and these, infinite where a state does nothing."""
-    inner = gram[-states:, -states:]
-    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    size = np.where(size > SILENT * np.max(size), size, np.inf)
-    return inner / np.outer(size, size), size
-
-
 def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
     """Squares of the first column by side, some last states at their best."""
     if states == 0 or not np.isfinite(grams).all():
@@ -647,10 +627,13 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
 def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float]:
     """Find what the initial states, which may be all but alike, take off the other columns; and what rounding may take off
     the square of the first column with it."""
-    if not np.isfinite(gram[-states:, -states:]).all():  # of a model that diverges
+    inner = gram[-states:, -states:]
+    if not np.isfinite(inner).all():  # of a model that diverges
         return np.zeros_like(gram[-states:, :-states]), 0.0
-    unit, size = _influence(gram, states)
-    values, vectors = np.linalg.eigh(unit)
+    # infinite where a state does nothing
+    size = np.sqrt(np.maximum(np.diag(inner), 0.0))
+    size = np.where(size > SILENT * np.max(size), size, np.inf)
+    values, vectors = np.linalg.eigh(inner / np.outer(size, size))
     largest = np.max(np.abs(values))
     significant = np.abs(values) > _ALIKE * largest
     inverse = (vectors * np.where(significant, 1.0 / np.where(significant, values, 1.0), 0.0)) @ vectors.T

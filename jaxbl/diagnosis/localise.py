@@ -198,7 +198,7 @@ def locate(
     (N m) nothing is said to be missing.
     """
     widest = max(residual.bandwidth for residual in residuals)
-    shortest = min(residual.time[-1] - residual.time[0] for residual in residuals)
+    shortest = min(map(_span, residuals))
     best: tuple[_Joined, list[np.ndarray]] | None = None
     for octave in range(7):
         cutoff = widest / 2.0**octave
@@ -214,28 +214,26 @@ def locate(
     assert best is not None
     joined, rows_of = best
     names = [name for name in coordinates[0] if all(name in values_of for values_of in coordinates)]
-    values = {
-        name: coordinates[0][name]._replace(
-            values=np.concatenate(
-                [values_of[name].values[rows] for values_of, rows in zip(coordinates, rows_of, strict=True)]
-            )
-        )
-        for name in names
-    }
     power, noise, z = joined.power, joined.noise, joined.z
     excess = max(power - noise, _LEVEL_UNKNOWN * noise)
-    over = {name: _over_coordinate(name, values_of, joined, excess) for name, values_of in values.items()}
+    over = {}
+    for name in names:
+        values = [values_of[name].values[rows] for values_of, rows in zip(coordinates, rows_of, strict=True)]
+        over[name] = _over_coordinate(name, coordinates[0][name]._replace(values=np.concatenate(values)), joined, excess)
     longest = int(np.argmax([len(residual.time) for residual in residuals]))
     motion = coordinates[longest]["speed"].values if "speed" in names else None
     peaks = _find_peaks(residuals[longest], motion, float(np.sqrt(excess / joined.count)))
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
-    beyond = (z > LIMITS.significant and missing > floor) or any(
-        (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
-        or (region.excess_z > LIMITS.significant and region.excess > floor**2)
-        for coordinate in over.values()
-        for region in coordinate.regions
+    beyond = (
+        (z > LIMITS.significant and missing > floor)
+        or any(
+            (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
+            or (region.excess_z > LIMITS.significant and region.excess > floor**2)
+            for coordinate in over.values()
+            for region in coordinate.regions
+        )
+        or any(peak.excess_z > LIMITS.significant and peak.amplitude > floor for peak in peaks)
     )
-    beyond = beyond or any(peak.excess_z > LIMITS.significant and peak.amplitude > floor for peak in peaks)
     return Localised(
         residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(power / joined.count)),
         float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), over, peaks,
@@ -283,7 +281,7 @@ def _mean_error(
         wave = np.linspace(1e-9, np.pi, _WAVES)
         share = [np.sinc(0.5 * n * wave / np.pi) ** 2 / np.sinc(0.5 * wave / np.pi) ** 2 for n in number]
         densities = np.mean([part.density_at(wave) / mean_density(part.density) for part in joined.parts], axis=0)
-        square = np.bincount(index, joined.deviation**2, minlength=count)[:count] / number
+        square = np.bincount(index, joined.deviation**2, count) / number
         error = np.sqrt(square * [mean_density(densities * passed) for passed in share])
         return error, mean / np.maximum(error, np.finfo(float).tiny)
     sums, numbers = _sums(joined.torque, joined.block, joined.blocks, index, count)
@@ -291,7 +289,7 @@ def _mean_error(
     weight = np.sum(numbers, axis=0) ** 2 / np.maximum(np.sum(numbers.astype(float) ** 2, axis=0), 1.0)
     freedom = np.maximum(weight - 1.0, 0.5)
     scatter = np.sqrt(np.sum((sums - mean * numbers) ** 2, axis=0) * (freedom + 1.0) / freedom) / number
-    size = np.sqrt(np.bincount(index, joined.torque**2, minlength=count)[:count] / number)
+    size = np.sqrt(np.bincount(index, joined.torque**2, count) / number)
     enough = (np.sum(numbers > 0, axis=0) >= _LEAST_BLOCKS) & (weight >= _LEAST_WEIGHT)
     error = np.maximum(np.where(enough, scatter, np.maximum(scatter, size)), np.finfo(float).tiny)
     return error, as_normal(mean / error, freedom)

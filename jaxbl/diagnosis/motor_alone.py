@@ -149,10 +149,8 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     announce("testing on held-out data")
     # names and numbers stand: only the verdict depends on what was held out
     held_out = task.holdout.open()
-    numbers: EffectNumbers = {name: {} for name in search.effects if name not in out}
-    for name, leaves in numbers.items():
-        path = model.free[search.effects[name]].path
-        leaves[path.rpartition(".")[2]] = alone.values[path]
+    paths = {name: model.free[i].path for name, i in search.effects.items() if name not in out}
+    numbers = {name: {path.rpartition(".")[2]: alone.values[path]} for name, path in paths.items()}
     summary = _summary(task, held_out, search, alone, gains, numbers) | {"history": describe_history(history)}
     numbers_of_model = {number.path: alone.values[number.path] for number in search.free}
     study = extended_study(task.config, numbers, numbers_of_model, task.record)
@@ -166,8 +164,13 @@ def _drop_needless(search: _Search, point: Point, out: list[str], history: list[
     while True:
         frictions = [name for name in search.effects if name not in (*out, *search.play)]
         points = {name: search.finish(point, [*out, name]) for name in frictions}
-        worth = search.without(out).spread(point).inflation
-        gains = {name: _gain(search, name, candidate, point, worth) for name, candidate in points.items()}
+        inflation, gains = search.without(out).spread(point).inflation, {}
+        # minus twice the log-likelihood by which a friction makes the fit better, correlation of the errors counted; without
+        # the prior of its level: none at all is far from any level that a fit begins with
+        for name, less in points.items():
+            i = search.effects[name]
+            prior = (less.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
+            gains[name] = float((less.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
         least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
         needless = least is not None and not gains[least] >= SHOWN
         for name, gain in gains.items():
@@ -177,16 +180,6 @@ def _drop_needless(search: _Search, point: Point, out: list[str], history: list[
             return point, gains
         out.append(least)
         point = points[least]
-
-
-def _gain(search: _Search, name: str, without: Point, point: Point, inflation: np.ndarray) -> float:
-    """Minus twice the log-likelihood by which a friction makes a fit better, correlation of the errors counted.
-
-    The prior of its level is no part of it: none at all is far from any level that a fit begins with.
-    """
-    i = search.effects[name]
-    prior = (without.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
-    return float((without.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
 
 
 def _summary(
@@ -203,8 +196,8 @@ def _summary(
     left, size = model.measure_unexplained(alone.point), input_rms(record)
     # noise of the recorded torque, which is known within a factor of two
     allowed = max(2.0 * model.torque_noise, _LEAST * size)
-    changes = zip(search.free, alone.point.theta / task.config.uncertainty.relative, strict=False)
-    far = {number.path: z for number, z in changes if abs(z) > LIMITS.far}
+    away = alone.point.theta / task.config.uncertainty.relative
+    far = {number.path: z for number, z in zip(search.free, away, strict=False) if abs(z) > LIMITS.far}
     names = [name for name in numbers if not (alone.doubtful and name in search.play)]
     failed, remainder = ["theta_e"] if holdout["rms"] > limit else [], left > allowed
     # where no more is left than a complete model leaves, neither model is better

@@ -92,8 +92,8 @@ def lean(experiment: Experiment, state: PlantState, free: Collection[str] = ()) 
         for effect, state in zip(experiment.effects, state.effects, strict=True)
         if effect.name in may or jax.tree.leaves(state) or not _is_neutral(effect)
     ]
-    effects, states = (tuple(column) for column in zip(*pairs, strict=True)) if pairs else ((), ())
-    return with_effects(experiment, effects), dataclasses.replace(state, effects=states)
+    experiment = with_effects(experiment, tuple(effect for effect, _ in pairs))
+    return experiment, dataclasses.replace(state, effects=tuple(own_state for _, own_state in pairs))
 
 
 def _is_neutral(effect: AbstractEffect) -> bool:

@@ -65,12 +65,7 @@ class Input(NamedTuple):
 
 
 def write_next_experiment(
-    folder: Path,
-    summary: JsonObject,
-    record: Record,
-    path: Path,
-    torque: float | None = None,
-    travel: float | None = None,
+    folder: Path, summary: JsonObject, record: Record, path: Path, torque: float | None = None, travel: float | None = None
 ) -> str:
     """Write the input as CSV with columns t (s) and u (N m). Returns a sentence on it.
 
@@ -115,12 +110,7 @@ def check_gap_sought(task: LogTask) -> None:
 
 
 def write_gap_experiment(
-    folder: Path,
-    summary: JsonObject,
-    record: Record,
-    path: Path,
-    torque: float | None = None,
-    travel: float | None = None,
+    folder: Path, summary: JsonObject, record: Record, path: Path, torque: float | None = None, travel: float | None = None
 ) -> str:
     """Write the move that would show a gap to the motor alone, where a log does not. Returns a sentence on it.
 
@@ -137,9 +127,8 @@ def write_gap_experiment(
     half, model = float(min(backlash["at_most"], backlash["nominal"] or np.inf)), read_config(folder / "model.toml")
     with jax.enable_x64(True):
         models = [on_record(config, record) for config in (model, with_gap(model, backlash["path"], half))]
-        experiment = _parting(
-            models, record, torque, travel, float(np.mean(record.torque)) if record.torque is not None else 0.0
-        )
+        assert record.torque is not None
+        experiment = _parting(models, record, torque, travel, float(np.mean(record.torque)))
     aim = f"a half gap of {half:.3g} {record.unit_of('motor.position', 'rad')}"
     if experiment is None:
         return f"No input stays within the torque and travel allowed that would show {aim}: --max-torque, --max-travel."
@@ -207,9 +196,7 @@ def _parting(
     sides = [side for side in first_model.sides if side in record.positions]
     noise = reading_noise(segments_of(record, sides))
     largest = np.max(np.abs(record.torque)) if torque is None else torque
-    inputs = [
-        trial._replace(torque=bias + trial.torque, mean=bias) for trial in _inputs(record, max(largest - abs(bias), 0.0))
-    ]
+    inputs = _inputs(record, max(largest - abs(bias), 0.0), bias)
     torques = jnp.asarray(np.stack([trial.torque for trial in inputs]))
     start = {
         side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
@@ -226,35 +213,36 @@ def _parting(
         if travel is None:
             reach = max(np.ptp(record.positions[side][part]) for part in record.segments)
         else:
-            reach = travel / (abs(float(first_model.drive.ratio(side))) if side != "motor" else 1.0)
-        first, second = (np.asarray(path[side]) for path in paths)
-        for path in (first, second):
-            finite = np.isfinite(path).all(axis=1)
-            inside &= finite & (np.ptp(np.where(np.isfinite(path), path, 0.0), axis=1) <= reach)
-        difference = np.where(np.isfinite(second - first), second - first, 0.0)
-        line = np.vander(np.linspace(-1.0, 1.0, difference.shape[1]), 2)
-        basis, _ = np.linalg.qr(line)
-        left = difference - (difference @ basis) @ basis.T
-        apart += 0.5 * np.sum((left / noise[side]) ** 2, axis=1)
+            reach = travel / abs(float(first_model.drive.ratio(side)))
+        # of a path that diverges nothing is finite, and it is not inside
+        with np.errstate(invalid="ignore", over="ignore"):
+            first, second = (np.asarray(path[side]) for path in paths)
+            for path in (first, second):
+                inside &= np.ptp(path, axis=1) <= reach
+            difference = second - first
+            basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, difference.shape[1]), 2))
+            left = difference - (difference @ basis) @ basis.T
+            apart += 0.5 * np.sum((left / noise[side]) ** 2, axis=1)
     if not inside.any():
         return None
     best = int(np.argmax(np.where(inside, apart, -1.0)))
     return inputs[best]._replace(apart=float(apart[best]))
 
 
-def _inputs(record: Record, largest: float) -> list[Input]:
-    """Inputs of up to a torque (N m), at the period of a log: kinds, amplitudes and frequencies."""
+def _inputs(record: Record, largest: float, mean: float) -> list[Input]:
+    """Inputs of up to a torque about a mean (N m), at the period of a log: kinds, amplitudes and frequencies."""
     period = record.sample_period
     # gaps of a log are no part of it
     duration = min(sum(part.stop - part.start for part in record.segments) * period, _LONGEST)
     time = period * np.arange(round(duration / period))
     top = min(0.02 / period, 10.0)
     inputs = []
-    for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES):
+    for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES).tolist():
         for kind in _KINDS:
-            wave = _wave(kind, time, float(frequency))
+            wave = _wave(kind, time, frequency)
             wave = wave / np.max(np.abs(wave))
-            inputs += [Input(kind, share * largest, float(frequency), share * largest * wave, 0.0) for share in _SHARES]
+            amplitudes = [share * largest for share in _SHARES]
+            inputs += [Input(kind, most, frequency, mean + most * wave, 0.0, mean) for most in amplitudes]
     return inputs
 
 
@@ -276,7 +264,6 @@ def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
 def _runs(
     experiment: Experiment, position: dict[str, Array], torques: Float[Array, "inputs samples"]
 ) -> dict[str, Float[Array, "inputs samples"]]:
-    initial = experiment.plant.init(experiment.initial)
     still = jax.tree.map(jnp.zeros_like, position)
-    start = PlantState(position, still, initial.effects)
+    start = PlantState(position, still, experiment.plant.init(experiment.initial).effects)
     return jax.vmap(lambda torque: plant_trajectory(experiment, start, torque).position)(torques)

@@ -46,11 +46,12 @@ class Contradiction(NamedTuple):
     """A number that two logs show to be different.
 
     Attributes:
-        path: of the number.
+        path, unit: of the number.
         least, most: what the two logs say that are furthest apart for their errors.
     """
 
     path: str
+    unit: str
     least: OfLog
     most: OfLog
 
@@ -84,7 +85,7 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
             OfLog(names[i], value + slope * float(by_log[i].change[k]), abs(slope) * float(by_log[i].error[k]))
             for i in max(apart, key=lambda pair: apart[pair])
         ]
-        contradicting.append(Contradiction(number.path, *sorted(pair, key=lambda of: of.value)))
+        contradicting.append(Contradiction(number.path, number.unit, *sorted(pair, key=lambda of: of.value)))
     return contradicting
 
 

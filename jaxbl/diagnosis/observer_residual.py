@@ -87,8 +87,7 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
             smoothed = segment.smoothed[side]
             modelled[side] = _hold_torque(*beyond[side]) / float(experiment.drive.inertia(side))
             drawn = float(smoothed.noise) * random.standard_normal((_DRAWS, len(segment)))
-            runs = np.concatenate([segment.readings[side][None], part.position[side] + drawn])
-            readings[side] = runs
+            readings[side] = np.concatenate([segment.readings[side][None], part.position[side] + drawn])
         controls = _controls(bare, segment.torque, readings, modelled, part)
         for side in experiment.sides:
             observed[side].append(_observe_side(experiment, side, part, np.asarray(controls[side])))
@@ -119,8 +118,10 @@ def _controls(
 
     def run(measured: TracedArrays) -> TracedArrays:
         begin = initial_state(experiment, {side: values[0] for side, values in measured.items()})
-        motion = {side: (part.position[side][0], part.velocity[side][0]) for side in experiment.sides}
-        observers = {side: initial_observer_state(experiment, side, *first) for side, first in motion.items()}
+        observers = {
+            side: initial_observer_state(experiment, side, part.position[side][0], part.velocity[side][0])
+            for side in experiment.sides
+        }
         state = State(None, observers, begin.equivalent_control, begin.identifier)
         return replay(experiment, torque, measured, record=keep, state=state, added_accelerations=added)[1]
 
@@ -150,7 +151,7 @@ def _observe_side(experiment: Experiment, side: str, part: Kinematics, controls:
     density = gaussian_filter1d(power, np.sqrt(12.0) / (2.0 * np.pi) * count / lags)
     residual = Residual(
         side, np.asarray(part.time)[skipped:], torque[0], np.full(count, deviation), density,
-        min(1.0 / (2.0 * np.pi * constant), 0.5 / period) if constant > 0.0 else 0.5 / period,
+        0.5 / max(np.pi * constant, period),
     )  # fmt: skip
     width = max(math.ceil(5.0 / share), _LEAST_SKIPPED)
     observer = getattr(experiment.observer, side)

@@ -156,8 +156,7 @@ class ReferenceLog:
         for side in experiment.sides:
             apart = float(np.max(np.abs(simulated[side] - windows.measured[side])))
             span = max(
-                *(np.ptp(segment.readings[side]) for segment in self.segments),
-                free / float(experiment.drive.ratio(side)),
+                *(np.ptp(segment.readings[side]) for segment in self.segments), free / float(experiment.drive.ratio(side))
             )
             departures[side] = apart / span if np.isfinite(apart) else np.inf
         return departures
@@ -173,7 +172,7 @@ class ReferenceLog:
         torques, parts, noises = self.find_lacking(experiment), [], []
         for i, model in enumerate(models or [experiment]):
             part = i, len(models) or 1
-            samples, noise = self._samples(model, self.samples, _STATES, part)
+            samples, noise = self._samples(model, part)
             narrowed = self._narrow_torques(self.find_lacking(model) if models else torques)
             parts.append(samples | {name: torque[_rows_of(len(torque), part)] for name, torque in narrowed.items()})
             noises.append(noise)
@@ -206,7 +205,7 @@ class ReferenceLog:
         experiment = at_period(experiment, self.period)
         if experiment.plant.has_memory or any(segment.transmitted is not None for segment in self.segments):
             return {}
-        run, firsts = self._runs(experiment, self.samples, _STATES)
+        run, firsts = self._runs(experiment, (0, 1))
         pieces = []
         for i, first in enumerate(firsts):
             segment = next(segment for segment in self.segments if segment.rows.start <= first < segment.rows.stop)
@@ -227,8 +226,8 @@ class ReferenceLog:
 
     def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
-        torques = self.find_lacking(experiment)
-        return {side: self._narrow_torques({side: pieces}, name)[f"torque_{side}"] for side, pieces in torques.items()}
+        torques = self._narrow_torques(self.find_lacking(experiment), name)
+        return {side: torques[f"torque_{side}"] for side in experiment.sides}
 
     def lacking_friction(self, experiment: Experiment, side: str) -> tuple[np.ndarray, np.ndarray]:
         """A dry friction and a steady torque of 1 N m on a side, behind the low-pass as in :meth:`missing`, shape
@@ -245,11 +244,11 @@ class ReferenceLog:
         friction = np.concatenate(columns, axis=1)
         return friction[:2], np.rint(friction[2]) > 0
 
-    def _samples(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[NamedArrays, Errors]:
-        """Errors of positions and speeds on windows of a length, where windows are foretold; shape (windows, samples). And
+    def _samples(self, experiment: Experiment, part: _Part) -> tuple[NamedArrays, Errors]:
+        """Errors of positions and speeds on the windows of a part, where these are foretold; shape (windows, samples). And
         what noise adds by way of the initial states, as of a comparison."""
-        run, firsts = self._runs(experiment, length, passes, part)
-        rows = firsts[:, None] + np.arange(length)[None, :]
+        run, firsts = self._runs(experiment, part)
+        rows = firsts[:, None] + np.arange(self.samples)
         errors_of = {
             POSITION_CHANNELS[side]: self.noise[side] * run.residual[:, :, i] for i, side in enumerate(experiment.sides)
         }
@@ -259,15 +258,15 @@ class ReferenceLog:
                 smoothed[segment.rows] = segment.smoothed[side].velocity
             errors_of[f"velocity_{side}"] = np.asarray(run.states.velocity[side]) - smoothed[rows]
         noise = {POSITION_CHANNELS[side]: float(run.noise[i]) for i, side in enumerate(experiment.sides)}
-        return {name: errors[:, count_seen(length) :] for name, errors in errors_of.items()}, noise
+        return {name: errors[:, count_seen(self.samples) :] for name, errors in errors_of.items()}, noise
 
-    def _runs(self, experiment: Experiment, length: int, passes: int, part: _Part = (0, 1)) -> tuple[Run, np.ndarray]:
-        """Runs on windows of a length, and the row that each begins with; arguments as of :meth:`_samples`."""
+    def _runs(self, experiment: Experiment, part: _Part) -> tuple[Run, np.ndarray]:
+        """Runs on the windows of a part, and the row that each begins with."""
         # the loop of steps is that of linearisations, which have these torques
         experiment, _ = with_torques(at_period(experiment, self.period))
-        windows, firsts = windows_of(self.segments, experiment, length, self.at_rest)
+        windows, firsts = windows_of(self.segments, experiment, self.samples, self.at_rest)
         indices = _rows_of(len(firsts), part)
-        return best_runs(experiment, windows, passes, self.at_rest, indices), firsts[indices]
+        return best_runs(experiment, windows, _STATES, self.at_rest, indices), firsts[indices]
 
 
 def parts_of_blocks(parts: int) -> np.ndarray:

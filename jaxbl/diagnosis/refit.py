@@ -30,7 +30,7 @@ from jaxbl.records.least_squares import BlockRegression
 from .blocks import QUARTERS
 from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
-from .linearised_model import SILENT, Linear, Predictor
+from .linearised_model import SILENT, Linear, Predictor, find_gains
 from .neutral_effects import complete, lean
 from .reference_log import BLOCKS, parts_of_blocks
 from .thresholds import LIMITS
@@ -81,15 +81,12 @@ class ModelFits:
 
     def linearise(self, numbers: EffectNumbers, theta: np.ndarray) -> Linear:
         """Linearise a model with some effects about the motion of the log."""
-        added = make_free_parameters(with_numbers(self.nominal, numbers), paths_of(numbers), self._torque)
-        widths = [EFFECTS[name].roles()[leaf].width for name in numbers for leaf in fitted_numbers(name)]
+        experiment = with_numbers(self.nominal, numbers)
+        size = float(np.std(np.concatenate([segment.torque for segment in self.segments])))
+        added = make_free_parameters(experiment, paths_of(numbers), size)
+        widths = [EFFECTS[name].roles()[leaf].width for name, leaf in map(owner_of, added)]
         start, prior = np.concatenate([theta, np.zeros(len(added))]), np.concatenate([self.prior, widths])
-        return Linear(with_numbers(self.nominal, numbers), (*self.free, *added), start, prior, self.segments)
-
-    @property
-    def _torque(self) -> float:
-        """Return the size of the input, N m."""
-        return float(np.std(np.concatenate([segment.torque for segment in self.segments])))
+        return Linear(experiment, (*self.free, *added), start, prior, self.segments)
 
     def fit(
         self,
@@ -155,8 +152,8 @@ class _Fit:
         self.released = {name: i for name in numbers if (i := fits.given.same(name)) is not None}
         added = {name: values for name, values in numbers.items() if name not in self.released}
         self.experiment = with_numbers(fits.nominal, added)
-        prior = fits.prior.copy()
-        prior[list(self.released.values())] = np.hypot(prior[list(self.released.values())], LIMITS.number_error)
+        prior, released = fits.prior.copy(), list(self.released.values())
+        prior[released] = np.hypot(prior[released], LIMITS.number_error)
         free, theta, width = [], [], []
         for number in make_free_parameters(self.experiment, paths_of(added), 1.0):
             name, leaf = owner_of(number)
@@ -214,8 +211,8 @@ class _Fit:
                 if smoothness != best.predictor.smoothness and smoothness not in options[:i]
             ]
             # the one that promises most is followed
-            other = min(points, key=self._promise, default=best)
-            if not self._promise(other) < best.cost - _SETTLED:
+            other = min(points, key=lambda point: point.predictor.promise, default=best)
+            if not other.predictor.promise < best.cost - _SETTLED:
                 break
             other = self._descend(other)
             if not other.cost < best.cost - _SETTLED:
@@ -227,14 +224,10 @@ class _Fit:
         """Choose the predictor along the smoothed motion."""
         return Linear(self.experiment, self.free, theta, self.width, self.segments).choose(()).smoothness
 
-    def _promise(self, point: _Point) -> float:
-        """Tell the cost that a linear step from a point promises."""
-        return point.predictor.cost(point.theta, self.width)
-
     def _descend(self, best: _Point) -> _Point:
         share = 1.0
         for _ in range(_STEPS):
-            if best.cost - self._promise(best) < _SETTLED or share < _LEAST_STEP:
+            if best.cost - best.predictor.promise < _SETTLED or share < _LEAST_STEP:
                 break
             coefficients = best.predictor.coefficients
             # a size that is far too large may go back to none at once
@@ -259,8 +252,7 @@ class _Fit:
         """Return the segments with the filtered motion of a model in place of the smoothed one."""
         sides = self.experiment.sides
         experiment = set_free_parameters(self.experiment, self.free, theta)
-        gain = Linear.gain_of(smoothness, self.segments[0].period)
-        gains = {side: gain[j] for j, side in enumerate(sides)}
+        gains = dict(zip(sides, find_gains(smoothness, self.segments[0].period), strict=True))
         path = []
         for segment, first in zip(self.segments, start, strict=True):
             position, velocity = (dict(zip(sides, half, strict=True)) for half in np.split(first, 2))
@@ -285,17 +277,16 @@ class _Fit:
 
     def finish(self, point: _Point) -> FittedModel:
         """Make the model, its covariance, and its errors; each quarter's by numbers fitted without it."""
-        experiment = set_free_parameters(self.experiment, self.free, point.theta)
+        linear, pieces = point.linear, []
         end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.predictor.smoothness, point.cost)
         count, sides = len(self.free), len(self.experiment.sides)
         none = np.full((count, count), np.inf)
         fitted = FittedModel(
-            tuple(self.numbers), experiment, self.free, point.theta, none, none, point.linear, np.zeros((QUARTERS, count)),
+            tuple(self.numbers), linear.experiment, self.free, point.theta, none, none, linear, np.zeros((QUARTERS, count)),
             self.log_odds, end=end,
         )  # fmt: skip
         if not np.isfinite(point.cost):
             return fitted
-        linear, pieces = point.linear, []
         size = np.sqrt(point.predictor.given / linear.count)
         for errors, signals in zip(linear.errors(point.predictor.smoothness), linear.signals, strict=True):
             flat = (errors / size[None, :, None]).reshape(-1, errors.shape[2])
@@ -375,14 +366,14 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     )
 
 
-def fitted_numbers(name: str) -> list[str]:
-    """List the numbers of an effect that are fitted: a harmonic is a whole number, and some are held."""
-    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind not in ("harmonic", "held")]
-
-
 def paths_of(names: Sequence[str] | EffectNumbers) -> list[str]:
-    """Return the dotted paths of the free numbers of effects."""
-    return [f"effects.{name}.{leaf}" for name in names for leaf in fitted_numbers(name)]
+    """Return the dotted paths of the numbers of effects that are fitted: a harmonic is a whole number, and some are held."""
+    return [
+        f"effects.{name}.{leaf}"
+        for name in names
+        for leaf, role in EFFECTS[name].roles().items()
+        if role.kind not in ("harmonic", "held")
+    ]
 
 
 def owner_of(number: FreeParameter) -> tuple[str, str]:

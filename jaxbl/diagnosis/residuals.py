@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import Motion
-from jaxbl.estimation.regression import Kinematics, Samples, SideSamples, effect_path
+from jaxbl.estimation.regression import Kinematics, SideSamples, effect_path
 from jaxbl.estimation.segments import Segment
 from jaxbl.estimation.smoother import JERK_COVARIANCE, TRANSITION, Smoothed, smoothed_accelerations
 from jaxbl.fused.compilation import jit
@@ -67,8 +67,7 @@ SideResiduals = dict[str, list[Residual]]
 """Residuals of each side, segment by segment."""
 
 
-@dataclass(frozen=True)
-class _Response:
+class _Response(NamedTuple):
     """A smoother away from the ends, over frequencies from 0 to half the sampling rate, in units of noise and period.
 
     Attributes:
@@ -120,11 +119,6 @@ def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.nda
     return accelerations.T.reshape(values.shape)
 
 
-def _mean_around(values: Samples) -> Samples:
-    """Mean over the sampling period on either side of each sample, weighted by a triangle, to fourth order."""
-    return values.at[1:-1].add(jnp.diff(values, n=2) / 12.0)
-
-
 def _torques(experiment: Experiment, position: dict, velocity: dict, *motion: Any) -> tuple[dict[str, Array], ...]:
     """All modelled torques on each side but for set-valued friction, and the level of that, N m; arguments as of
     :meth:`jaxbl.drive.plant.Plant.side_torques`."""
@@ -134,10 +128,16 @@ def _torques(experiment: Experiment, position: dict, velocity: dict, *motion: An
 
 
 def _dry(
-    experiment: Experiment, side: str, part: Kinematics, states: Any, torque: Array, acting: tuple[Array, Array], held: Array
+    experiment: Experiment,
+    side: str,
+    part: Kinematics,
+    states: Any,
+    driving: Array,
+    acting: tuple[Array, Array],
+    held: Array,
 ) -> tuple[Array, Array]:
-    """Dry friction along a part, N m, by what else is `acting` on the side and its level; its derivative by the velocity at
-    a reversal, whose time the velocity's noise leaves open."""
+    """Dry friction along a part, N m, by what else is `acting` on the side (its input is `driving`) and its level; its
+    derivative by the velocity at a reversal, whose time the velocity's noise leaves open."""
     (total, level), velocity, acceleration = acting, part.velocity[side], part.acceleration[side]
     period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
     # the share of the time around a sample in forward motion less that in backward motion, seen as the rest is
@@ -145,7 +145,7 @@ def _dry(
     passage = jnp.clip(velocity / step, -1.0, 1.0)
     direction = passage * (2.0 - jnp.abs(passage))
     # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
-    motion = Motion(part.time, part.position[side], velocity, torque if side == "motor" else jnp.zeros_like(torque))
+    motion = Motion(part.time, part.position[side], velocity, driving)
     bent, most = experiment.plant.holding_torque(side, motion, states)
     inertia = experiment.plant.inertia(side)
     needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
@@ -178,20 +178,23 @@ class _Equation(NamedTuple):
 def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, _Equation]:
     """Equations of all sides along a part; `held`: where a side is not shown to move for a while."""
     states, torque = effect_path(experiment, part)
-    arguments = part.position, part.velocity, states, torque, part.time, part.transmitted
     drive, equations = experiment.drive, {}
 
     def of(position: dict, velocity: dict, *motion: Any) -> tuple[Any, Any]:
         total, level = torques = _torques(experiment, position, velocity, *motion)
         return {side: total[side] - level[side] * jnp.sign(velocity[side]) for side in total}, torques
 
-    slopes, (totals, levels) = jax.vmap(jax.jacfwd(of, argnums=(0, 1), has_aux=True))(*arguments)
+    slopes, (totals, levels) = jax.vmap(jax.jacfwd(of, argnums=(0, 1), has_aux=True))(
+        part.position, part.velocity, states, torque, part.time, part.transmitted
+    )
     for side in experiment.sides:
         total, (by_position, by_velocity) = totals[side], slopes[side]
-        friction, turning = _dry(experiment, side, part, states, torque, (total, levels[side]), held[side])
-        # the input is a mean around the sample already; of the rest, the mean that the position's second differences see
         driving = torque if side == "motor" else jnp.zeros_like(torque)
-        modelled = driving + _mean_around(total - driving) - friction
+        friction, turning = _dry(experiment, side, part, states, driving, (total, levels[side]), held[side])
+        # the input is a mean around the sample already; of the rest, the mean that the position's second differences see:
+        # over the period on either side, weighted by a triangle, to fourth order
+        without_input = total - driving
+        modelled = driving + without_input.at[1:-1].add(jnp.diff(without_input, n=2) / 12.0) - friction
         inertia, acceleration, velocity = experiment.plant.inertia(side), part.acceleration[side], part.velocity[side]
         added = (inertia - drive.inertia(side)) * acceleration
         nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
@@ -230,10 +233,10 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
         sensor = 0.0 if part.transmitted is None else estimate_white_noise([np.asarray(part.transmitted)])
         equations = _along(experiment, segment)
         for side, pieces in residuals.items():
-            equation, slopes = equations[side], (equations[side].by_position, equations[side].by_velocity)
+            equation = equations[side]
             missing = equation.taken - as_smoothed(equation.modelled, segment.smoothed[side], segment.period)
             level = abs(float(experiment.drive.torque_gain(side))) * sensor
-            variance, spectrum = _noise(segment, side, slopes, float(equation.inertia), level, responses)
+            variance, spectrum = _noise(segment, side, equation, level, responses)
             deviation = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
             bandwidth = responses[side].corner / (2.0 * np.pi * segment.period)
             pieces.append(Residual(side, segment.time, missing, deviation, spectrum, bandwidth))
@@ -246,7 +249,7 @@ def _responses(segment: Segment) -> dict[str, _Response]:
         side: float(smoothed.jerk) * segment.period**5 / float(smoothed.noise) ** 2
         for side, smoothed in segment.smoothed.items()
     }
-    slowest = min(_corner(value) for value in smoothness.values())
+    slowest = _corner(min(smoothness.values()))
     size = int(2 ** np.ceil(np.log2(64.0 * 2.0 * np.pi / slowest)))
     return {side: _response(value, min(max(size, 1024), _LARGEST)) for side, value in smoothness.items()}
 
@@ -254,8 +257,7 @@ def _responses(segment: Segment) -> dict[str, _Response]:
 def _noise(
     segment: Segment,
     side: str,
-    slopes: Sequence[Mapping[str, Array]],
-    inertia: float,
+    equation: _Equation,
     sensor: float,
     responses: Mapping[str, _Response],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -264,6 +266,7 @@ def _noise(
     By the derivatives of the torque by all positions and velocities; `sensor`: noise of a measured torque in it, N m.
     """
     low_pass, corner = responses[side].low_pass, responses[side].corner
+    inertia, slopes = float(equation.inertia), (equation.by_position, equation.by_velocity)
     # white noise of the sensor
     spectrum = low_pass**2 * sensor**2
     variance = np.full(len(segment), mean_density(spectrum))

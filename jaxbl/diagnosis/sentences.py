@@ -96,13 +96,13 @@ def _find_crowded(located: Localised) -> tuple[float, str] | None:
     for coordinate in located.coordinates.values():
         if coordinate.name in (EVERYWHERE, "direction", "input", "acceleration", "twist rate"):
             continue
-        power, time = (np.array([getattr(r, key) for r in coordinate.regions]) for key in ("power_share", "time_share"))
-        z = np.array([r.excess_z for r in coordinate.regions])
+        keys = "power_share", "time_share", "excess_z"
+        power, time, z = (np.array([getattr(r, key) for r in coordinate.regions]) for key in keys)
         if coordinate.name == "reversals":
             near = np.array([r.label.startswith("reversals") for r in coordinate.regions])
             groups = [near] if near.any() else []
         elif any(r.label for r in coordinate.regions):
-            groups = [np.arange(len(power)) == i for i in range(len(power))]
+            groups = list(np.eye(len(power), dtype=bool))
         else:
             numbers = np.arange(len(power))
             groups = [(numbers >= i) & (numbers <= j) for i in range(len(power)) for j in range(i, len(power))]

@@ -93,7 +93,12 @@ def set_up(task: DiagnosisTask) -> Setup:
     recorded = segments_of(record, nominal.sides, at_rest)
     free = make_free_parameters(bare, default_paths(config, bare), signal_sizes(bare, recorded))
     prior = np.full(len(free), config.uncertainty.relative)
-    _check_stable(task, nominal, ReferenceLog(recorded, {}, at_rest))
+    for side, apart in ReferenceLog(recorded, {}, at_rest).largest_departures(nominal).items():
+        if not apart < _DIVERGED:
+            raise InputError(
+                f"{record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
+                f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
+            )
     return _drive_by_input(task, bare, nominal, free, prior, recorded, _input_noise(input_rms(record), nominal, recorded))
 
 
@@ -102,8 +107,9 @@ def doubt_input(setup: Setup, model: Experiment) -> Setup | None:
     if setup.input_noise.unfelt > 0.0:
         return None
     noise = _input_noise(input_rms(setup.task.record), model, setup.recorded)
-    same = setup.task, setup.bare, setup.nominal, setup.free, setup.prior, setup.recorded
-    return _drive_by_input(*same, noise) if noise.unfelt > 0.0 else None
+    if not noise.unfelt > 0.0:
+        return None
+    return _drive_by_input(setup.task, setup.bare, setup.nominal, setup.free, setup.prior, setup.recorded, noise)
 
 
 def _drive_by_input(
@@ -152,13 +158,3 @@ def _check_order(bare: Experiment) -> None:
     effects = complete(bare, candidates(bare)).effects
     if twice is not None and [effect.name for effect in effects[: len(names)]] != names:
         raise InputError(f"effects: two are {twice}; list them before those of the actuator")
-
-
-def _check_stable(task: DiagnosisTask, nominal: Experiment, log: ReferenceLog) -> None:
-    """Refuse a model that diverges under the log's input."""
-    for side, apart in log.largest_departures(nominal).items():
-        if not apart < _DIVERGED:
-            raise InputError(
-                f"{task.record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
-                f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
-            )

@@ -18,9 +18,7 @@ class Thresholds:
     )
     sure: float = parameter("standard errors", "that count as a difference between two models: 2 % by chance", default=2.0)
     noise_structure: float = parameter(
-        "nats a sample",
-        "that structure in the noise may bring, such as quantisation: 1.2 % of its variance",
-        default=0.006,
+        "nats a sample", "that structure in the noise may bring, such as quantisation: 1.2 % of its variance", default=0.006
     )
     effect_odds: float = parameter(
         "nats", "log prior odds of each effect to be missing: a probability of 0.12, of some twenty effects two or three",
@@ -67,9 +65,7 @@ class Thresholds:
         "missing torque", "that an explanation takes away: with less it passes only as its numbers are open", default=0.5
     )
     significant: float = parameter(
-        "standard deviations",
-        "from which on a torque is beyond noise: several hundred regions are looked at",
-        default=4.5,
+        "standard deviations", "from which on a torque is beyond noise: several hundred regions are looked at", default=4.5
     )
     contradicting: float = parameter(
         "standard errors", "by which two logs contradict each other: of pairs with errors by twelve blocks one in a hundred",

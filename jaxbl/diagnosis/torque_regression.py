@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbl.drive.effects import Numbers
 from jaxbl.drive.parameters import get_leaf
-from jaxbl.records.least_squares import BlockRegression
+from jaxbl.records.least_squares import BlockRegression, mean_error
 
 from .candidates import Candidate, Forces, MotionTorques, columns_of, contains, replaces
 from .linearised_model import Linear
@@ -32,11 +32,18 @@ _MOST = 6
 
 
 class TorqueProposal(NamedTuple):
-    """A candidate, its numbers, and the share of the missing torque's rms that it takes away by cross-validation."""
+    """A candidate, its numbers, the share of the missing torque's rms that it takes away by cross-validation, and the mean
+    squared errors that it leaves of each block, by side."""
 
-    name: str
+    variant: Candidate
     numbers: Numbers
     share: float
+    squares: Sequence[np.ndarray]
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.variant.name
 
 
 class TorqueRegression:
@@ -93,35 +100,38 @@ class TorqueRegression:
                 # blocks of a row say nothing
                 self.variants = []
             self.sides.append(BlockRegression.of(target / size, np.transpose(columns) / size, _BLOCKS))
+        # without any candidate
+        self.squares = self._cross_validate([])[0] if self.variants else []
 
     def propose(self) -> list[TorqueProposal]:
         """Propose the best variant of each effect that surely takes something away, the best effect first."""
-        before = self._cross_validate([])[0] if self.variants else []
         best: dict[str, TorqueProposal] = {}
         for variant in self.variants:
-            trial = self._try([], variant, before)
-            if trial is not None and trial[0].share > (best[variant.name].share if variant.name in best else 0.0):
-                best[variant.name] = trial[0]
+            trial = self._try([], variant, self.squares)
+            if trial is not None and trial.share > (best[variant.name].share if variant.name in best else 0.0):
+                best[variant.name] = trial
         return sorted(best.values(), key=lambda proposal: -proposal.share)
 
     def propose_together(self) -> dict[str, Numbers]:
         """Propose effects that take most away one after the other, with their numbers together."""
         chosen: list[Candidate] = []
-        squares = self._cross_validate([])[0] if self.variants else []
+        squares = self.squares
         linear = [variant for variant in self.variants if not variant.offset]
         while len(chosen) < _MOST:
-            trials = []
-            for variant in linear:
-                if not any(replaces(variant.name, other.name) or replaces(other.name, variant.name) for other in chosen):
-                    trial = self._try(chosen, variant, squares)
-                    if trial is not None and trial[0].share > SHOWN:
-                        trials.append((trial[0].share, variant, trial[1]))
+            trials = [
+                trial
+                for variant in linear
+                if not any(replaces(variant.name, other.name) or replaces(other.name, variant.name) for other in chosen)
+                and (trial := self._try(chosen, variant, squares)) is not None
+                and trial.share > SHOWN
+            ]
             if not trials:
                 break
-            most = max(trials, key=lambda trial: trial[0])
-            plain = [trial for trial in trials if contains(most[1].name, trial[1].name) and trial[0] > most[0] - SHOWN]
-            _, best, squares = max(plain or [most], key=lambda trial: trial[0])
-            chosen.append(best)
+            most = max(trials, key=lambda trial: trial.share)
+            plain = [trial for trial in trials if contains(most.name, trial.name) and trial.share > most.share - SHOWN]
+            best = max(plain or [most], key=lambda trial: trial.share)
+            squares = best.squares
+            chosen.append(best.variant)
         values = self._cross_validate(chosen)[1] if chosen else np.zeros(0)
         numbers, place = {}, 0
         for variant in chosen:
@@ -131,19 +141,17 @@ class TorqueRegression:
                 numbers[variant.name] = of
         return numbers
 
-    def _try(
-        self, beside: Sequence[Candidate], variant: Candidate, before: Sequence[np.ndarray]
-    ) -> tuple[TorqueProposal, list[np.ndarray]] | None:
+    def _try(self, beside: Sequence[Candidate], variant: Candidate, before: Sequence[np.ndarray]) -> TorqueProposal | None:
         """Try a candidate beside others; None where it takes nothing away, or its numbers are not allowed."""
         after, values = self._cross_validate([*beside, variant])
         gains = np.sum([(old - new) / np.mean(old) for old, new in zip(before, after, strict=True)], axis=0)
-        z = float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(_BLOCKS), 1e-300))
+        z = float(np.mean(gains) / max(mean_error(gains), 1e-300))
         ratio = np.prod([np.mean(new) / np.mean(old) for old, new in zip(before, after, strict=True)])
         place = sum(other.width for other in beside)
         numbers = variant.numbers(values[place : place + variant.width].tolist())
         if numbers is None or not z > LIMITS.difference:
             return None
-        return TorqueProposal(variant.name, numbers, 1.0 - float(np.sqrt(ratio))), after
+        return TorqueProposal(variant, numbers, 1.0 - float(np.sqrt(ratio)), after)
 
     def _cross_validate(self, chosen: Sequence[Candidate]) -> tuple[list[np.ndarray], np.ndarray]:
         """Find the mean squared errors of each block left out, by side, and the coefficients by all blocks.

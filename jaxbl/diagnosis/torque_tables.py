@@ -7,16 +7,17 @@ Reference: P. Eilers, B. Marx, Flexible smoothing with B-splines and penalties, 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import Tabulated
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.estimation.segments import Segment
 from jaxbl.json_types import JsonObject
-from jaxbl.records.least_squares import BlockRegression
+from jaxbl.records.least_squares import BlockRegression, mean_error
 
 from .blocks import QUARTERS, standard_errors_better
 from .reference_log import BLOCKS, Comparison, Errors, ReferenceLog, parts_of_blocks
@@ -36,8 +37,7 @@ _LEAST = 5
 _TURN = 2.0 * np.pi
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Torque over one coordinate.
 
     Attributes:
@@ -55,8 +55,7 @@ class Table:
     left_out: np.ndarray
 
 
-@dataclass(frozen=True)
-class Tabulation:
+class Tabulation(NamedTuple):
     """A model with tables, which predicts parts of the log that they were not fitted to better than without.
 
     Attributes:
@@ -91,11 +90,7 @@ class Tabulation:
 
 
 def tabulate(
-    log: ReferenceLog,
-    experiment: Experiment,
-    compared: Comparison,
-    lacking: SideResiduals,
-    sliding: Sequence[str],
+    log: ReferenceLog, experiment: Experiment, compared: Comparison, lacking: SideResiduals, sliding: Sequence[str]
 ) -> Tabulation | None:
     """Tables of what a model still lacks, if parts of the log that they were not fitted to are predicted better with them;
     else None.
@@ -140,30 +135,26 @@ def _fit_tables(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, ro
     }
     nothing = np.array([np.mean(part**2) for part in np.array_split(target, BLOCKS)])
     fits_found = []
-    for overs in _sets(list(choices)):
+    # coordinates alone, then a position with the speed
+    for overs in [*([over] for over in choices), *([over, "speed"] for over in choices if over != "speed")]:
         if len(target) < _LEAST * sum(widths[over] for over in overs):
             continue
         matrix = np.concatenate([columns[over] for over in overs], axis=1)
         fits = [_Fit.of(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
         fit = min(fits, key=lambda candidate: np.mean(candidate.squares))
         gain = nothing - fit.squares
-        sure = np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(BLOCKS)
+        sure = np.mean(gain) > mean_error(gain)
         if sure and 1.0 - np.sqrt(np.mean(fit.squares) / np.mean(nothing)) > _GAIN:
             fits_found.append((overs, fit))
     if not fits_found:
         return []
     _, best = min(fits_found, key=lambda candidate: np.mean(candidate[1].squares))
     # the fewest tables of those within one standard error of the best
-    limit = np.mean(best.squares) + np.std(best.squares - nothing, ddof=1) / np.sqrt(BLOCKS)
+    limit = np.mean(best.squares) + mean_error(best.squares - nothing)
     overs, fit = next((overs, candidate) for overs, candidate in fits_found if np.mean(candidate.squares) <= limit)
     ends = np.cumsum([widths[over] for over in overs])[:-1]
     parts = (np.split(values, ends, axis=-1) for values in (fit.values, fit.errors, fit.left_out))
     return [Table(*columns) for columns in zip(overs, [choices[over] for over in overs], *parts, strict=True)]
-
-
-def _sets(overs: Sequence[str]) -> list[list[str]]:
-    """Coordinates alone, then a position with the speed."""
-    return [*([over] for over in overs), *([over, "speed"] for over in overs if over != "speed")]
 
 
 def _choices(segments: Sequence[Segment], side: str, rotary: bool) -> dict[str, np.ndarray]:
@@ -188,8 +179,7 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     return low_passed(as_smoothed(hats, smoothed, segment.period), lacking, cutoff).T
 
 
-@dataclass(frozen=True)
-class _Fit:
+class _Fit(NamedTuple):
     """Penalised least squares: values, their standard errors, mean squared errors of each block left out, and values without
     one quarter of the blocks after the other."""
 
@@ -200,12 +190,8 @@ class _Fit:
 
     @classmethod
     def of(cls, matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> "_Fit":
-        penalty, start = _RIDGE * np.eye(matrix.shape[1]), 0
-        for width in widths:
-            second = np.diff(np.eye(width), n=2, axis=0)
-            penalty[start : start + width, start : start + width] += stiffness * second.T @ second
-            start += width
-        penalty *= np.mean(matrix**2) * len(target)
+        second = np.asarray(block_diag(*(np.diff(np.eye(width), n=2, axis=0) for width in widths)))
+        penalty = (_RIDGE * np.eye(matrix.shape[1]) + stiffness * second.T @ second) * (np.mean(matrix**2) * len(target))
         regression = BlockRegression.of(target, matrix, BLOCKS, penalty)
         left_out = np.stack([regression.fit(np.flatnonzero(parts_of_blocks(QUARTERS) == part)) for part in range(QUARTERS)])
         return cls(regression.fit(), regression.errors(), regression.held_out(), left_out)
@@ -216,9 +202,9 @@ def _numbers(tables: Sequence[Table]) -> JsonObject:
     numbers: JsonObject = {}
     for table in tables:
         points, torques = ("speeds", "speed_torques") if table.over == "speed" else ("positions", "position_torques")
-        numbers |= {points: table.points.tolist(), torques: table.torques.tolist()} | (
-            {"turn": True} if table.over == "turn" else {}
-        )
+        numbers |= {points: table.points.tolist(), torques: table.torques.tolist()}
+        if table.over == "turn":
+            numbers["turn"] = True
     return numbers
 
 
@@ -227,7 +213,7 @@ def _with_tables(experiment: Experiment, tables: Mapping[str, Sequence[Table]], 
     added = []
     for side, of_side in tables.items():
         if without is not None:
-            of_side = [replace(table, torques=table.left_out[without]) for table in of_side]
+            of_side = [table._replace(torques=table.left_out[without]) for table in of_side]
         numbers = {key: tuple(number) if isinstance(number, list) else number for key, number in _numbers(of_side).items()}
         added.append(as_arrays(Tabulated(side=side, **numbers), float))
     return with_effects(experiment, (*added, *experiment.effects))

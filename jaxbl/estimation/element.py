@@ -17,7 +17,7 @@ from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
 from jaxbl.records.element import Element, element_error
-from jaxbl.records.inspection import element_displacement, fit_record_element, make_rig_log
+from jaxbl.records.inspection import compute_twist, fit_record_element, make_rig_log
 
 from .logs import SealedRecord
 
@@ -135,7 +135,7 @@ def run_element(task: ElementTask) -> ElementIdentification:
             f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){remark}; "
             "see columns and signs in [log]"
         )
-    moved = element_displacement(record, task.gear_ratio)
+    moved = compute_twist(record, task.gear_ratio)
     trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": element.torque})
     return ElementIdentification(task, element, to_jsonable(_summary(task, element)), trace, _tables(element))
 

@@ -14,10 +14,9 @@ from .gearing import Flanks, Gearing, find_flank
 from .least_squares import fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
-    find_bandwidth,
+    find_motion_bandwidth,
     interpolate_spline,
     long_segments,
-    longest_segment,
     low_pass,
     low_pass_motion,
     trim_filter_ends,
@@ -62,8 +61,7 @@ class NominalDrive:
         return ratio * inertia, ratio * (self.motor_viscous + self.load_viscous / self.gear_ratio**2)
 
 
-@dataclass(frozen=True)
-class Skew:
+class Skew(NamedTuple):
     """Delay of the stamps of theta_s against its readings, compared with theta_e, that only a clock can cause.
 
     Attributes:
@@ -77,8 +75,7 @@ class Skew:
     max_windup_delay: float
 
 
-@dataclass(frozen=True)
-class Offset:
+class Offset(NamedTuple):
     """Value of theta_e - gear_ratio theta_s without torque, midway between the flanks of the gap.
 
     Attributes:
@@ -182,7 +179,7 @@ class _Regression(NamedTuple):
 def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Regression | None:
     """Regress the twist, with theta_s shifted by a skew (s); None if the motion is too small."""
     motor, load = grid.values["theta_e"], grid.values["theta_s"]
-    width = find_bandwidth(motor[longest_segment(grid.segments)], grid.period, differentiate=True)
+    width = find_motion_bandwidth(motor, grid.segments, grid.period)
     segments, cutoff = long_segments(grid.segments), 4.0 * width
     if not width or not segments or "u" not in grid.values:
         return None
@@ -203,7 +200,7 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
         for flank in (shaft_torque, velocity, acceleration):
             is_clear = np.abs(flank) > 0.3 * rms(flank)
             share = np.mean(flank[is_clear] > 0.0) if is_clear.any() else 0.0
-            if is_clear.sum() >= 0.25 * len(is_clear) and 0.05 < share < 0.95:
+            if np.mean(is_clear) >= 0.25 and 0.05 < share < 0.95:
                 yield np.sign(flank), is_clear
 
     best = find_flank(target, terms, list_flanks())

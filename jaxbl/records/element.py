@@ -24,8 +24,8 @@ import numpy as np
 from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
-from .least_squares import BlockRegression, column_rms, fit_residual, fit_with_jackknife, rms, student_interval
-from .signal_quality import MIN_SAMPLES, find_bandwidth, longest_segment, low_pass, slices_between
+from .least_squares import BlockRegression, column_rms, fit_residual, fit_with_jackknife, mean_error, rms, student_interval
+from .signal_quality import MIN_SAMPLES, count_samples, find_motion_bandwidth, low_pass, slices_between
 
 _MAX_SAMPLES = 20_000
 """Samples that are fitted; of longer logs, means. A few hundred describe a loop of torque over displacement."""
@@ -240,13 +240,13 @@ def fit_element(log: RigLog, *, linear: bool) -> Element | None:
 def _average_samples(log: RigLog) -> RigLog:
     """Average neighbouring samples of a long log."""
     position, torque, segments, period, noise = log
-    width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True) or 1.0 / (len(position) * period)
+    width = find_motion_bandwidth(position, segments, period) or 1.0 / (len(position) * period)
     count = min(math.ceil(len(position) / _MAX_SAMPLES), int(1.0 / (_SAMPLES_PER_PERIOD * width * period)))
     if count < 2:
         return log
     parts = []
     for s in segments:
-        mean_count = (s.stop - s.start) // count
+        mean_count = count_samples(s) // count
         if mean_count >= _MIN_MEANS:
             samples = np.stack([position[s], torque[s]])[:, : mean_count * count]
             parts.append(samples.reshape(2, mean_count, count).mean(axis=2))
@@ -257,7 +257,7 @@ def _average_samples(log: RigLog) -> RigLog:
 
 def _prepare_rig(log: RigLog) -> _Rig | None:
     position, torque, segments, period, noise = log
-    width = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
+    width = find_motion_bandwidth(position, segments, period)
     cutoff = _CUTOFF_RATIO * width or math.inf
     smooth, rate, direction = np.zeros((3, len(position)))
     stretches: list[tuple[slice, bool]] = []
@@ -324,8 +324,11 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
             for term in TERMS
             if term not in best.terms
         ]
-        gains = [(_compute_gain(rig, best, model) if model.is_possible else None, model) for model in models]
-        candidates = [(len(model.shapes), -gain, model) for gain, model in gains if gain is not None]
+        candidates = [
+            (len(model.shapes), -gain, model)
+            for model in models
+            if model.is_possible and (gain := _compute_gain(rig, best, model)) is not None
+        ]
         if not candidates:
             return best
         # of two that are equally good, the one with fewer numbers
@@ -411,9 +414,8 @@ def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
     Logarithms are compared: a term may matter a hundred times as much in one block as in another.
     """
     gains = np.log(_held_out_errors(rig, without) / _held_out_errors(rig, model))
-    error = float(np.std(gains, ddof=1)) / math.sqrt(_FOLDS)
     mean = float(np.mean(gains))
-    return math.expm1(mean) if mean > _SURE_ERRORS * error else None
+    return math.expm1(mean) if mean > _SURE_ERRORS * mean_error(gains) else None
 
 
 def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, float], linear: bool) -> Element:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .least_squares import BlockRegression, fit_residual, fit_with_jackknife, rms
+from .least_squares import BlockRegression, fit_residual, fit_with_jackknife, mean_error, rms
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
 from .resampling import Grid
 from .rigid_body import smooth_sign
@@ -196,12 +196,14 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
     period = grid.period
     width = _velocity_bandwidth(grid.values["theta_s"][longest_segment(grid.segments)], period)
     constant = _regress_motor(grid, 4.0 * width, skew)
-    drift, fit, error, reach = 0.0, None, np.inf, 0.0
+    if constant is None:
+        return None
+    drift, fit, error, reach = 0.0, constant, np.inf, 0.0
     half = 0.5 * float(grid.time[-1] - grid.time[0])
     # converges quadratically, as the skew does
     for _ in range(6):
         fit = _regress_motor(grid, 4.0 * width, skew, drift)
-        if fit is None or constant is None:
+        if fit is None:
             return None
         *_, values, errors = fit
         step, drift_step, error = (float(x / values[0]) for x in (values[1], values[-1], errors[-1]))
@@ -211,13 +213,12 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
             return None
         if abs(step) + abs(drift_step) * half < 1e-3 * period:
             break
-    assert fit is not None and constant is not None
     # of what a fit leaves, since squares of a position hide those of its errors
     before, after = (
         BlockRegression.of(target - rows @ values, rows, _FOLDS).held_out() for target, rows, values, _ in (constant, fit)
     )
     gains = np.log(before / after)
-    better = float(np.mean(gains)) > 2.0 * float(np.std(gains, ddof=1)) / _FOLDS**0.5
+    better = float(np.mean(gains)) > 2.0 * mean_error(gains)
     if not better or abs(drift) < 6.0 * abs(error) or reach < 0.05 * period:
         return None
     return Drift(drift, abs(error), reach)
@@ -272,10 +273,10 @@ def _fit_lost_motion(
     def list_flanks() -> Flanks:
         for mixture in _FLANK_MIXTURES / (_rms(velocity), _rms(acceleration)):
             flank = mixture @ (velocity, acceleration)
-            pieces = np.split(np.abs(flank) > 0.3, ends)
-            if sum(map(np.sum, pieces)) >= 0.25 * len(flank):
-                clear_pieces = [minimum_filter1d(piece, 2 * guard + 1, mode="nearest") for piece in pieces]
-                yield np.sign(flank), np.concatenate(clear_pieces)
+            is_clear = np.abs(flank) > 0.3
+            if np.mean(is_clear) >= 0.25:
+                pieces = [minimum_filter1d(piece, 2 * guard + 1, mode="nearest") for piece in np.split(is_clear, ends)]
+                yield np.sign(flank), np.concatenate(pieces)
 
     best = find_flank(twist, terms, list_flanks())
     if best is None:
@@ -368,7 +369,7 @@ def _regress_motor(
             mixed = [mixture @ part[3:] for part in parts]
             # between the flanks the twist may have any value in the gap
             is_clear = np.abs(join_segments(mixed)) > 0.3
-            if is_clear.sum() >= 0.25 * len(is_clear):
+            if np.mean(is_clear) >= 0.25:
                 yield join_segments(low_pass(smooth_sign(m), cutoff, period) for m in mixed), is_clear
 
     best = find_flank(target, rows, list_flanks())

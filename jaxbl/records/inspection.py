@@ -62,7 +62,7 @@ class Inspection:
         channel = record.statistics.channels[POSITION_CHANNELS[side]]
         is_rotary = channel.unit == "rad"
         if self.log.kind == "element":
-            displacement, torque = np.ptp(element_displacement(record, self.gear_ratio)), record.torque
+            displacement, torque = np.ptp(compute_twist(record, self.gear_ratio)), record.torque
             assert torque is not None
             return (
                 f"As read: displacement over {displacement:.3g} {channel.unit}, u over {np.ptp(torque):.3g} "
@@ -80,10 +80,9 @@ class Inspection:
     @property
     def twist(self) -> np.ndarray | None:
         """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None with one encoder."""
-        positions = self.record.positions
-        if self.gear_ratio is None or len(positions) < 2:
+        if self.gear_ratio is None or len(self.record.positions) < 2:
             return None
-        twist = positions["motor"] - self.gear_ratio * positions["load"]
+        twist = compute_twist(self.record, self.gear_ratio)
         return twist - np.median(twist)
 
     def to_dict(self) -> dict[str, Any]:
@@ -135,8 +134,8 @@ def inspect(
     return Inspection(record, table, ratio, reversals, tuple(judgements))
 
 
-def element_displacement(record: Record, gear_ratio: float | None) -> np.ndarray:
-    """Return the displacement of an element, rad (m), shape (samples,).
+def compute_twist(record: Record, gear_ratio: float | None) -> np.ndarray:
+    """Return the twist of a transmission, rad (m), shape (samples,); of an element on a test rig its displacement.
 
     It is the position of one side, less `gear_ratio` times that of the other side if it was recorded.
     """
@@ -154,7 +153,7 @@ def make_rig_log(record: Record, gear_ratio: float | None) -> RigLog:
     assert record.torque is not None
     statistics = record.statistics.channels
     noise = twist_noise(gear_ratio or 1.0, statistics["theta_e"], statistics.get("theta_s"))
-    displacement = element_displacement(record, gear_ratio)
+    displacement = compute_twist(record, gear_ratio)
     return RigLog(displacement, record.torque, record.segments, record.sample_period, noise)
 
 
@@ -320,7 +319,7 @@ def fit_twist(record: Record, speed: np.ndarray, ratio: float) -> tuple[float, f
     """
     torque = record.torque if record.transmitted is None else record.transmitted
     assert torque is not None
-    twist = record.positions["motor"] - ratio * record.positions["load"]
+    twist = compute_twist(record, ratio)
     cutoff = 4.0 * record.statistics.channels["theta_e"].bandwidth or math.inf
     signals = np.stack([twist, torque, np.sign(speed), speed, np.ones(len(twist))], axis=1)
     smooth = np.concatenate([low_pass(signals[segment], cutoff, record.sample_period) for segment in record.segments])

@@ -13,10 +13,9 @@ from .least_squares import column_rms, fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
     MIN_SAMPLES,
-    find_bandwidth,
+    find_motion_bandwidth,
     interpolate_spline,
     long_segments,
-    longest_segment,
     low_pass,
     trim_filter_ends,
 )
@@ -59,7 +58,7 @@ def estimate_lateness(grid: Grid, encoders: Sequence[str], period: float) -> Lat
     The low-passed torque, moved in time, is regressed on acceleration, velocity, its sign, position and a constant, without
     the rows about reversals, at which friction sticks and gaps are crossed. `period` is that of the log, s.
     """
-    bandwidth = find_bandwidth(grid.values[encoders[0]][longest_segment(grid.segments)], grid.period, differentiate=True)
+    bandwidth = find_motion_bandwidth(grid.values[encoders[0]], grid.segments, grid.period)
     segments = [slice(s.start, min(s.stop, s.start + _MAX_SAMPLES)) for s in long_segments(grid.segments)]
     cutoffs = [cutoff for factor in _CUTOFFS if (cutoff := factor * bandwidth) * grid.period < _MAX_CUTOFF]
     if not segments or not bandwidth or np.ptp(grid.values["u"]) == 0.0:
@@ -97,16 +96,13 @@ def _fit_lateness(
         is_inner = np.zeros(len(snap), bool)
         is_inner[trim_filter_ends(len(snap), cutoff, period)] = True
         moving_rows.append(is_inner & ~np.asarray(maximum_filter1d(is_slow, 2 * reach + 1, mode="constant"), bool))
-        torques.append(low_pass(grid.values["u"][segment], cutoff, period))
+        torques.append((grid.time[segment], low_pass(grid.values["u"][segment], cutoff, period)))
     motion, rows = np.concatenate(columns), np.concatenate(moving_rows)
     if rows.sum() < 3 * MIN_SAMPLES:
         return None
     lateness, step = 0.0, math.inf
     while True:
-        moved = [
-            interpolate_spline(times, torque, times + lateness)
-            for times, torque in zip((grid.time[segment] for segment in segments), torques, strict=True)
-        ]
+        moved = [interpolate_spline(times, torque, times + lateness) for times, torque in torques]
         slope = np.concatenate([_differentiate(torque, period) for torque in moved])[rows]
         target, regressors = np.concatenate(moved)[rows], np.column_stack([motion[rows], -slope])
         values, errors = fit_with_jackknife(target, regressors)

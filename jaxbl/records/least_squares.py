@@ -26,6 +26,11 @@ def column_rms(columns: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(columns**2, axis=0))
 
 
+def mean_error(values: np.ndarray) -> float:
+    """Return the standard error of the mean of independent values, such as those of blocks of a log."""
+    return float(np.std(values, ddof=1)) / len(values) ** 0.5
+
+
 @dataclass(frozen=True)
 class BlockRegression:
     """Least squares of a target on columns, by products over blocks of consecutive rows.
@@ -107,7 +112,8 @@ def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.n
     regression = BlockRegression.of(target, regressors)
     unit, size = regression.unit_matrix
     if not np.linalg.cond(unit) <= 1e13:
-        return np.full(len(size), np.nan), np.full(len(size), np.nan)
+        unknown = np.full(len(size), np.nan)
+        return unknown, unknown
     return regression.fit(), regression.errors()
 
 

@@ -210,10 +210,9 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     work_share = float(torque @ steps / exchanged) if exchanged else 0.0
     has_clear_inertia = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
     # 8 standard errors prove the wrong sign, 3 are enough for the right one
-    accelerates_against_torque, accelerates_with_torque = (
-        has_clear_inertia and sign * rigid_fit.values[0] > errors_required * rigid_fit.errors[0]
-        for sign, errors_required in ((-1.0, 8.0), (1.0, 3.0))
-    )
+    inertia, error = rigid_fit.values[0], rigid_fit.errors[0]
+    accelerates_against_torque = has_clear_inertia and -inertia > 8.0 * error
+    accelerates_with_torque = has_clear_inertia and inertia > 3.0 * error
     if displacement > 0.2 * np.abs(steps).sum():
         # potential energy may pay for the motion
         work_share = max(work_share, 0.0)

@@ -142,7 +142,9 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
 
 def _find_basis(waves: np.ndarray) -> np.ndarray:
     """Return orthonormal columns that span a constant and some waves, as far as numbers tell these apart."""
-    columns, sizes, _ = np.linalg.svd(np.column_stack([np.ones(len(waves)), waves.real, waves.imag]), full_matrices=False)
+    columns, sizes, _ = np.linalg.svd(
+        np.column_stack([np.ones(len(waves)), np.real(waves), np.imag(waves)]), full_matrices=False
+    )
     return columns[:, sizes > 1e-6 * sizes[0]]
 
 

@@ -14,7 +14,7 @@ from jaxbl.errors import InputError
 from .alignment import NominalDrive
 from .channels import POSITION_FACTORS, SPEED_FACTORS
 from .files import LogFile, read_log_file
-from .inspection import Inspection, compute_velocity, fit_twist, inspect
+from .inspection import Inspection, compute_twist, compute_velocity, fit_twist, inspect
 from .libraries import ColumnName
 from .table import POSITION_CHANNELS
 from .time_stamps import SECONDS_PER_UNIT
@@ -243,11 +243,7 @@ def _guess_time_unit(unit: str, values: np.ndarray, guesses: list[str]) -> str:
 
 
 def propose_study(
-    path: str | Path,
-    log: _Table | None = None,
-    *,
-    gear_ratio: float | None = None,
-    nominal: NominalDrive | None = None,
+    path: str | Path, log: _Table | None = None, *, gear_ratio: float | None = None, nominal: NominalDrive | None = None
 ) -> tuple[_Table, list[str], Inspection]:
     """Propose a study of a log for `identify` and `diagnose`.
 
@@ -352,7 +348,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     guesses.append("Inertia and friction are divided evenly between the sides, and the stiffness is a rough guess.")
     # half of the torque winds the shaft up
     slope, slope_error, _ = fit_twist(record, compute_velocity(record), ratio)
-    twist = np.std(record.positions["motor"] - ratio * record.positions["load"]) - 0.5 * gearing.lost_motion
+    twist = np.std(compute_twist(record, ratio)) - 0.5 * gearing.lost_motion
     least = 0.5 * float(np.std(record.torque)) / max(float(twist), 0.1 * gearing.lost_motion, 1e-300)
     # False for nan, too
     stiffness = max(0.5 / max(slope, 2.0 * slope_error, 1e-300), least if least < 1e12 else 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbl.quantity import Quantity
 
 from .least_squares import column_rms, fit_with_jackknife, rms
-from .signal_quality import find_bandwidth, long_segments, longest_segment, low_pass, low_pass_motion, trim_filter_ends
+from .signal_quality import find_motion_bandwidth, long_segments, low_pass, low_pass_motion, trim_filter_ends
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def smooth_sign(velocity: np.ndarray) -> np.ndarray:
 
 def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
     """Regress a torque, held from each stamp to the next, on the motion of an encoder; None if that is too small."""
-    bandwidth = find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
+    bandwidth = find_motion_bandwidth(position, segments, period)
     if bandwidth == 0.0 or np.ptp(torque) == 0.0:
         return None
     # three times the bandwidth: the corners of the motion stay, noise of the second derivative goes

@@ -112,6 +112,11 @@ def find_bandwidth(values: np.ndarray, period: float, *, differentiate: bool) ->
     return float(frequency[np.searchsorted(cumulative, 0.95 * cumulative[-1])])
 
 
+def find_motion_bandwidth(position: np.ndarray, segments: Sequence[slice], period: float) -> float:
+    """Return the bandwidth of the velocity, Hz, in the longest segment; 0 if the motion does not exceed the noise."""
+    return find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
+
+
 def find_runs(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return first row, and row behind the last one, of each run of rows that meet a condition, shape (runs,)."""
     edges = np.flatnonzero(np.diff(condition, prepend=False, append=False))
@@ -197,11 +202,16 @@ def segments_before(segments: Sequence[slice], end: int) -> list[slice]:
     return [slice(segment.start, min(segment.stop, end)) for segment in segments if segment.start < end]
 
 
+def count_samples(segment: slice) -> int:
+    """Return the number of samples of a segment."""
+    return segment.stop - segment.start
+
+
 def longest_segment(segments: Sequence[slice]) -> slice:
     """Return the longest segment."""
-    return max(segments, key=lambda segment: segment.stop - segment.start)
+    return max(segments, key=count_samples)
 
 
 def long_segments(segments: Sequence[slice]) -> list[slice]:
     """Return the segments that are long enough to be filtered and regressed."""
-    return [segment for segment in segments if segment.stop - segment.start >= MIN_SAMPLES]
+    return [segment for segment in segments if count_samples(segment) >= MIN_SAMPLES]

@@ -150,8 +150,7 @@ class TorqueTable(_ChannelTable):
         "unit of the column: N m, N, V, A or counts; left out: N m, or N on a linear axis"
     )
     factor: float | None = _optional(
-        "N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1",
-        gt=0.0,
+        "N m (N on a linear axis) in one number of the column; needed for V, A and counts; else 1", gt=0.0
     )
     offset: float = Field(default=0.0, description="added last, in SI units")
     saturation: Positive | None = _optional("magnitude, in numbers of the column, at which it saturates", gt=0.0)
@@ -195,7 +194,7 @@ class LogTable(StrictTable):
     )
     hold: Literal["zoh", "sampled"] | None = _optional(
         "u between stamps: zoh: each value holds until the next stamp, as a command does; sampled: a smooth "
-        "torque, measured at its stamps, as a drive reports its current; left out: zoh, or sampled where that is sure",
+        "torque, measured at its stamps, as a drive reports its current; left out: zoh, or sampled where that is sure"
     )
     initial_state: Literal["unknown", "rest"] = Field(default="unknown", description="state at the first sample")
     t: TimeTable | None = _optional("time stamps; left out: column t, in s")
@@ -219,9 +218,7 @@ class LogTable(StrictTable):
     start: float | None = _optional("reads from here on, counted from the first stamp", ge=0.0, json_schema_extra=_SECONDS)
     stop: float | None = _optional("reads up to here, counted from the first stamp", gt=0.0, json_schema_extra=_SECONDS)
     resample: Positive | None = _optional(
-        "period to resample to; left out: the log's own, uneven stamps to their median",
-        gt=0.0,
-        json_schema_extra=_SECONDS,
+        "period to resample to; left out: the log's own, uneven stamps to their median", gt=0.0, json_schema_extra=_SECONDS
     )
     closed_loop: bool | None = _optional("whether a controller chose u from the positions; left out: not known")
 

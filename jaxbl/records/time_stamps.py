@@ -13,7 +13,7 @@ from jaxbl.workers import check_cost
 
 from .files import LogFile, read_log_file
 from .libraries import Column, ColumnName, read_at
-from .signal_quality import MIN_SAMPLES, find_resolution, longest_segment, slices_between
+from .signal_quality import MIN_SAMPLES, count_samples, find_resolution, longest_segment, slices_between
 from .table import LogTable, TimeTable
 
 GAP_PERIODS = 3.5
@@ -239,7 +239,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     fits = [fit_even_stamps(times[segment]) for segment in segments]
     # of parts with different periods none can be read with that of another; stamps may be rounded to a period
     is_even = all(
-        fit.is_even and abs(fit.period / fits[0].period - 1.0) < 1e-3 + 1.0 / _count_samples(segment)
+        fit.is_even and abs(fit.period / fits[0].period - 1.0) < 1e-3 + 1.0 / count_samples(segment)
         for fit, segment in zip(fits, segments, strict=True)
     )
     # a spline needs increasing stamps
@@ -250,9 +250,9 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
     times, rows = times[distinct], rows[distinct]
     pieces, segments = _split_at_intervals(times, stamps.max_interval)
-    samples = sum(map(_count_samples, segments))
+    samples = sum(map(count_samples, segments))
     if samples < MIN_SAMPLES:
-        longest_piece = max(map(_count_samples, pieces))
+        longest_piece = max(map(count_samples, pieces))
         raise file.error(
             f"gaps leave no {MIN_SAMPLES} samples in a row (the longest part has {longest_piece}); a log needs them"
         )
@@ -276,7 +276,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         )
     if is_even:
         for piece, fit in zip(segments, fits, strict=True):
-            times[piece] = fit.first + fit.period * np.arange(_count_samples(piece))
+            times[piece] = fit.first + fit.period * np.arange(count_samples(piece))
         period = fits[segments.index(longest_segment(segments))].period
     sampling = Sampling(
         samples=len(stamps.times),
@@ -290,15 +290,11 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     return SegmentedStamps(times, distinct, segments, period, sampling)
 
 
-def _count_samples(segment: slice) -> int:
-    return segment.stop - segment.start
-
-
 def _split_at_intervals(stamps: np.ndarray, max_interval: float) -> tuple[list[slice], list[slice]]:
     """Return the pieces between longer intervals, and those of them that are long enough for a segment."""
     starts = np.flatnonzero(np.diff(stamps) > max_interval) + 1
     pieces = slices_between([0, *starts.tolist(), len(stamps)])
-    return pieces, [piece for piece in pieces if _count_samples(piece) >= MIN_SAMPLES // 2]
+    return pieces, [piece for piece in pieces if count_samples(piece) >= MIN_SAMPLES // 2]
 
 
 class StampFit(NamedTuple):

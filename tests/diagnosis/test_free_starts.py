@@ -35,7 +35,7 @@ def log(tmp_path_factory):
 def test_runs_are_those_of_the_fit(log, from_rest):
     (model, _), record = log
     windows, _ = windows_of(segments_of(record, model.sides), model, 250, from_rest)
-    actual, seen = best_runs(model, windows, 8, from_rest), count_seen(250)
+    actual, seen = best_runs(model, windows, 8, from_rest, np.arange(8)), count_seen(250)
     first = dataclasses.replace(
         windows,
         torque=windows.torque[:, :seen],
@@ -56,13 +56,13 @@ def test_noise_of_the_state_that_is_fitted_is_foretold(tmp_path):
     model, _ = with_torques(as_arrays(prepare(read_config(study)), float))
     segments = segments_of(record_study(study, tmp_path), model.sides)
     windows, _ = windows_of(segments, model, 250)
-    random, runs = np.random.default_rng(2), []
+    random, runs, every_window = np.random.default_rng(2), [], np.arange(len(windows.time))
     for _ in range(20):
         measured = {
             side: np.asarray(readings) + float(windows.noise[side]) * random.standard_normal(readings.shape)
             for side, readings in windows.measured.items()
         }
-        runs.append(best_runs(model, dataclasses.replace(windows, measured=measured), 8, False))
+        runs.append(best_runs(model, dataclasses.replace(windows, measured=measured), 8, False, every_window))
     foretold = np.stack([run.residual[:, count_seen(250) :] for run in runs])
     scatter = np.sqrt(np.mean(np.var(foretold, axis=0, ddof=1), axis=(0, 1)))
     np.testing.assert_allclose(scatter, np.hypot(1.0, runs[0].noise), rtol=0.1)
@@ -75,7 +75,7 @@ def test_a_state_that_follows_from_the_motion_is_free_only_where_a_log_begins(lo
     swinging = make_effect("load.flexibility", inertia=0.5, frequency=3.0)
     model = with_effects(model, (*model.effects, as_arrays(swinging, float)))
     windows, _ = windows_of(segments_of(record, model.sides, from_rest), model, 250, from_rest)
-    runs = best_runs(model, windows, 4, from_rest)
+    runs = best_runs(model, windows, 4, from_rest, np.arange(len(windows.time)))
     for have, start in zip(runs.states.effects[-1], windows.start.effects[-1], strict=True):
         moved = np.asarray(have)[:, 0] != np.asarray(start)
         assert not moved[1:].any() and moved[0] == (not from_rest)

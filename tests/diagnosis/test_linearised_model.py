@@ -12,8 +12,8 @@ from trace_segment import make_segment
 
 from jaxbl.config import prepare, read_config
 from jaxbl.diagnosis import linearised_model as module
-from jaxbl.diagnosis.candidates import Forces, MotionTorques, columns_of, forces_of, variants_of
-from jaxbl.diagnosis.linearised_model import Linear
+from jaxbl.diagnosis.candidates import Forces, MotionTorques, columns_of, variants_of
+from jaxbl.diagnosis.linearised_model import Linear, find_gains
 from jaxbl.drive.effects import EFFECTS, Scales, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.estimation.free_parameters import make_free_parameters
@@ -58,7 +58,7 @@ def geared_model():
 
 def prediction_errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
-    predicted = module._errors(model.parts[0], model.gain([1e-6] * len(model.sides)), forces or Forces([]))
+    predicted = module._errors(model.parts[0], find_gains([1e-6] * len(model.sides), model.period), forces or Forces([]))
     flat = predicted.reshape(-1, predicted.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     remainder = flat[:, : -model.states]
@@ -133,7 +133,7 @@ def test_friction_under_load_of_one_inertia_follows_what_its_load_takes():
 
 def test_a_lag_begins_with_what_had_lasted_or_at_rest(geared_model):
     (signals,), lag = geared_model.signals, as_arrays(make_effect("actuator.lag", time_constant=0.01), float)
-    steps, torque = geared_model.period / 0.01, signals.torque[: signals.samples]
+    steps, torque = geared_model.period / 0.01, signals.part.torque[: signals.samples]
     settled, rested = (signals.of([lag], from_rest)[0][-1] for from_rest in (False, True))
     assert torque[0] != 0.0 and settled[0] == pytest.approx(0.0, abs=1e-12)
     # what the state at the first sample leaves until later
@@ -186,7 +186,8 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     noise = np.array([2e-5, 3e-5])
     columns = model.columns(variants, smoothness, noise)
     assert len(columns.products) > model_columns + 2 * module._TOGETHER
-    predicted = module._errors(model.parts[0], model.gain(smoothness), forces_of(variants, model.signals[0]))
+    forces = Forces(columns_of(variants, model.signals[0]))
+    predicted = module._errors(model.parts[0], find_gains(smoothness, model.period), forces)
     gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
     expected = module._eliminate(gram, model.states)
     size = np.sqrt(np.diag(expected))

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from jaxbl.chain import plant_trajectory, with_effects
 from jaxbl.diagnosis.diagnosis_task import read_diagnosis_task
-from jaxbl.diagnosis.linearised_model import Linear
+from jaxbl.diagnosis.linearised_model import find_gains
 from jaxbl.diagnosis.refit import ModelFits, _Fit, leave_quarters_out
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
@@ -42,7 +42,7 @@ def test_prediction_errors_are_least(fits):
     found = fit.run(np.zeros(len(fits.free)), None)
     # without the effects that do nothing
     plain = with_effects(fit.experiment, tuple(effect for effect in fit.experiment.effects if effect.name == NAME))
-    gain = {"motor": Linear.gain_of(found.predictor.smoothness, segment.period)[0]}
+    gain = {"motor": find_gains(found.predictor.smoothness, segment.period)[0]}
     torque, reading = jnp.asarray(segment.torque), jnp.asarray(segment.readings["motor"])
 
     @jit
@@ -100,7 +100,7 @@ def test_the_error_of_a_number_is_what_the_number_is_off_by(fits):
     slope = both.free[-1].slope(0.0)
     variance = [both.covariance[i, i] * number.scale**2, both.covariance[-1, -1] * slope**2]
     together = sum(variance) + 2.0 * both.covariance[i, -1] * number.scale * slope
-    assert together == pytest.approx((number.slope(one.theta[i]) * one.deviation[i]) ** 2, rel=0.1)
+    assert together == pytest.approx(number.slope(one.theta[i]) ** 2 * one.covariance[i, i], rel=0.1)
     assert np.sqrt(variance[0]) == pytest.approx(fits.prior[i] * number.scale)
 
 
