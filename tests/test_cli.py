@@ -1178,7 +1178,7 @@ def test_after_logs_what_is_open_by_what_was_found():
 def test_after_runs_and_searches_what_to_do_with_the_gains():
     good, failed, file, folder = Result("t", "good", "."), Result("t", "failed", "."), Path("a b.toml"), Path("out")
     ((tune, _),) = after_run(good, file)
-    assert tune == "jaxbl tune 'a b.toml'" and after_run(failed, file) == [NextStep(tune, "Which gains converge?")]
+    assert tune == "jaxbl tune 'a b.toml'" and after_run(failed, file) == [NextStep(tune, "Which gains surely converge?")]
     assert [step.command for step in after_tuning(good, file, folder)] == [
         "jaxbl simulate 'a b.toml' --gains out/gains.toml --out out_run",
         "jaxbl export 'a b.toml' --gains out/gains.toml --out out_code",

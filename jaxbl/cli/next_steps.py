@@ -54,7 +54,7 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
 
 def after_run(card: "Result", config: Path) -> list[NextStep]:
     """Propose the command that chooses gains, after one run with those of the study."""
-    gains = "converge" if card.verdict == "failed" else "have less error, and what limits them"
+    gains = "have less error, and what limits them" if card.verdict == "good" else "surely converge"
     return [_propose(f"Which gains {gains}?", "tune", config)]
 
 

@@ -53,7 +53,7 @@ class Setup(NamedTuple):
         sliding: sides whose positions are no angles.
         bare: the model as given.
         nominal: the same with all effects without a state at neutral numbers.
-        own: its numbers that are not exactly known.
+        free: its numbers that are not exactly known.
         prior: relative standard deviation of each.
         recorded: segments of the log that numbers are fitted to, with the input as it was recorded.
         fitted: that log, with the input that drives models.
