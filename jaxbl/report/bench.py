@@ -13,14 +13,18 @@ from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, Be
 from .drawing import save
 from .panels import BLUE, GREEN, VERMILION, Axis, Bars, Figure, Line, Panel
 
+
+def draw_throughput(result: BenchResult) -> list[Figure]:
+    """The figures of a benchmark."""
+    return [_bars(result), _curve(result)]
+
+
 _SPEED = Axis("lane-steps per second", log=True)
 
 
 def _bars(result: BenchResult) -> Figure:
-    names = sorted(
-        dict.fromkeys(row.name for row in result.rows),
-        key=lambda name: result.find_speed(name, "float32") or result.find_speed(name, "float64") or 0.0,
-    )
+    names = list(dict.fromkeys(row.name for row in result.rows))
+    names.sort(key=lambda name: result.find_speed(name, "float32") or result.find_speed(name, "float64") or 0.0)
     bars, speeds = [], []
     for shift, precision, opacity in ((0.19, "float32", 1.0), (-0.19, "float64", 0.45)):
         for who, colour in (("jaxbl", VERMILION), ("others", BLUE)):
@@ -106,6 +110,6 @@ def throughput_lines(result: BenchResult) -> Lines:
 def write_bench_report(result: BenchResult, folder: Path) -> Lines:
     """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
     write_json(folder / "bench.json", asdict(result))
-    for figure in (_bars(result), _curve(result)):
+    for figure in draw_throughput(result):
         save(figure, folder / "figures" / f"{figure.name}.png")
     return throughput_lines(result)

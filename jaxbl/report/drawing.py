@@ -5,7 +5,6 @@ import contextlib
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
-from scipy.spatial.distance import cdist
 
 from jaxbl.json_types import JsonObject
 
@@ -166,17 +164,16 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     grid = canvas.add_gridspec(rows, columns + shared, width_ratios=[*[1.0] * columns, *[0.035 * columns] * shared])
     axes, axes_by_axis = [], {}
     for i, panel in enumerate(panels):
-        named_axes = panel.axes.items()
-        how = {f"share{name}": axes_by_axis.get((name, axis)) for name, axis in named_axes if axis.label}
+        how = {f"share{name}": axes_by_axis.get((name, axis)) for name, axis in panel.axes.items() if axis.label}
         ax = canvas.add_subplot(grid[i // columns, i % columns], **how)
-        axes_by_axis |= dict.fromkeys(named_axes, ax)
+        axes_by_axis |= dict.fromkeys(panel.axes.items(), ax)
         axes.append(ax)
         _draw_panel(ax, panel)
         above = 0.0 if below else _legend_above(ax, names[i], figure.width / columns)
         ax.set_title(panel.title, loc="left", pad=6.0 + 72.0 * above)
         # the panels below and on the left, on which the same axis stands
         neighbours = {"x": panels[i + columns :][:1], "y": panels[i - 1 : i] if i % columns else ()}
-        for name, axis in named_axes:
+        for name, axis in panel.axes.items():
             if axis.label and any(neighbour.axes[name] == axis for neighbour in neighbours[name]):
                 ax.tick_params(axis=name, labelbottom=False, labelleft=False)  # type: ignore[arg-type]
                 ax.set(**{f"{name}label": ""})
@@ -194,9 +191,8 @@ def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
 
 def _scales(panels: Sequence[Panel]) -> list[Scale]:
     """Scales of maps that have a colour bar."""
-    return list(
-        dict.fromkeys(part.scale for panel in panels for part in panel.parts if isinstance(part, Map) and part.scale.label)
-    )
+    maps = (part for panel in panels for part in panel.parts if isinstance(part, Map) and part.scale.label)
+    return list(dict.fromkeys(part.scale for part in maps))
 
 
 def _size_legend(handles: dict[str, Any], width: float) -> tuple[int, float]:
@@ -218,8 +214,8 @@ def _legend_above(ax: Axes, handles: dict[str, Any], width: float) -> float:
 
 def _draw_bar(canvas: Canvas, scale: Scale, **where: Any) -> None:
     """Draw the colour bar of a scale."""
-    colours, label = ScalarMappable(_norm(scale), scale.colours), "\n".join(textwrap.wrap(scale.label, 44))
-    bar = canvas.colorbar(colours, label=label, **where)
+    label = "\n".join(textwrap.wrap(scale.label, 44))
+    bar = canvas.colorbar(ScalarMappable(_norm(scale), scale.colours), label=label, **where)
     bar.outline.set_visible(False)  # type: ignore[operator]
     if scale.log:
         _set_log_ticks(bar.ax.yaxis, scale.low, scale.high)
@@ -257,7 +253,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
             drawn.set_ticks(places, texts)
             drawn.grid(False)
         elif axis.log:
-            _set_log_ticks(drawn, *drawn.get_view_interval())
+            _set_log_ticks(drawn, *getattr(ax, f"get_{name}lim")())
         else:
             drawn.set_major_locator(MaxNLocator(ticks[name], steps=[1, 2, 5, 10]))
         if axis.ratio is not None:
@@ -284,7 +280,7 @@ def _line_look(line: Line) -> dict[str, Any]:
 
 def _draw_line(ax: Axes, line: Line, layer: float) -> None:
     if line.held:
-        x, y = np.clip(line.x, *sorted(ax.get_xlim())), np.clip(line.y, *sorted(ax.get_ylim()))  # type: ignore[call-overload]
+        x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
         line = line._replace(x=x, y=y)
     look = _line_look(line) | {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
     (artist,) = ax.plot(line.x, line.y, **look)
@@ -307,7 +303,7 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
         (low, high), margin = np.asarray(ax.bbox), np.array([room, 2.0 * _NAME_SIZE])
         fit = ((middle > low + margin) & (middle < high - margin)).all(axis=1) & (up < across)
         beside = np.concatenate([np.full((1, 2), np.inf), *(neighbour for neighbour in paths if neighbour is not path)])
-        apart = cdist(middle, beside).min(axis=1).clip(max=10.0 * _NAME_SIZE)
+        apart = np.hypot(*(middle[:, None] - beside).transpose(2, 0, 1)).min(axis=1).clip(max=10.0 * _NAME_SIZE)
         worth = np.where(fit, apart - 4.0 * np.hypot(*(middle - 0.5 * (first + last)).T), -np.inf)
         if fit.any():
             i = int(np.argmax(worth))
@@ -327,7 +323,7 @@ def _follow(ax: Axes, line: Line) -> np.ndarray:
         path = ax.transData.transform(np.column_stack([line.x, line.y]))
     path = np.clip(np.nan_to_num(path), *ax.bbox.padded(100.0).get_points())
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    return np.column_stack([np.interp(np.linspace(0.0, way[-1], 301), way, places) for places in path.T])
+    return np.stack([np.interp(np.linspace(0.0, way[-1], 301), way, places) for places in path.T], axis=1)
 
 
 def _draw_band(ax: Axes, band: Band, layer: float) -> None:
@@ -343,10 +339,12 @@ def _draw_span(ax: Axes, span: Span, layer: float) -> None:
 
 
 def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
-    draw = partial(ax.pcolormesh, cells.x, cells.y, rasterized=True, zorder=layer)
+    how: Any = {"rasterized": True, "zorder": layer}
+    values = np.where(cells.failed, np.nan, cells.values)
     if np.any(cells.failed):
-        draw(np.where(cells.failed, 0.0, np.nan), cmap=ListedColormap([MISSING]))
-    draw(np.where(cells.failed, np.nan, cells.values), cmap=cells.scale.colours, norm=_norm(cells.scale))
+        grey = np.where(cells.failed, 0.0, np.nan)
+        ax.pcolormesh(cells.x, cells.y, grey, cmap=ListedColormap([MISSING]), **how)
+    ax.pcolormesh(cells.x, cells.y, values, cmap=cells.scale.colours, norm=_norm(cells.scale), **how)
 
 
 def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
@@ -362,14 +360,13 @@ def _legend_handles(panel: Panel) -> dict[str, Any]:
     """The legend's handle of each name in a panel that does not stand beside its line."""
     handles = {}
     for part in panel.parts:
-        name = part.name
         is_hidden = part.at_line if isinstance(part, Line) else isinstance(part, Map) and not np.any(part.failed)
-        if is_hidden or not name or name in handles:
+        if is_hidden or not part.name or part.name in handles:
             continue
         if isinstance(part, Span) and part.low == part.high:
-            part = Line([], [], name, part.colour, part.width, part.dashes)
+            part = Line([], [], part.name, part.colour, part.width, part.dashes)
         if isinstance(part, Line):
-            handles[name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
+            handles[part.name] = Line2D([], [], **_line_look(part._replace(size=max(min(part.size, 9.0), 4.0))))
         else:
-            handles[name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
+            handles[part.name] = Patch(color=getattr(part, "colour", MISSING), alpha=getattr(part, "opacity", 1.0), lw=0.0)
     return handles
