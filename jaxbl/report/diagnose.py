@@ -141,9 +141,10 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
         return "no answer", "The logs contradict each other: one model cannot hold for all of them."
     if summary.get("numbers_off"):
         word, answer = _verdict(summary | {"numbers_off": 0})
+        lead = "The numbers are further off than stated"
         if verdict == "no_discrepancy":
-            answer = f"No effect is needed: with fitted numbers the model {_AS_WELL}."
-        return word, f"{answer} The numbers are further off than stated."
+            return word, f"{lead}; no effect is needed. With fitted ones the model {_AS_WELL}."
+        return word, f"{lead}. {answer}"
     if verdict == "no_discrepancy":
         return "good", f"Nothing is missing: the model {_AS_WELL}."
     if verdict == "explained":
