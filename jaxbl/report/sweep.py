@@ -158,7 +158,7 @@ class _Survey:
         edges = []
         for (judged, path), counts in self.by_value.items():
             if judged == side and is_numeric_dtype(counts.index):
-                below = counts.cumsum()[:-1]
+                below = counts.cumsum().iloc[:-1]
                 above = counts.sum() - below
                 shares = zip(below.index, below["sum"] / below["size"], above["sum"] / above["size"], strict=True)
                 edges += [(path, *split) for split in shares if abs(split[1] - split[2]) >= _PARTED]
