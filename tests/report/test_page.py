@@ -124,6 +124,16 @@ def test_page_of_a_sweep(tmp_path):
         assert text in page.text
 
 
+def test_a_sweep_says_up_to_where_an_observer_converges():
+    axes = [listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4), listed_axis("drive.motor_viscous", 0.1, 0.2)]
+    edge = {"motor__converged": lambda frame: frame["encoders.noise"] < 5e-5}
+    found = describe(make_result(rigid_study(axes=axes), **edge))
+    assert found.verdict == "doubtful"
+    assert found.headline.endswith("converges in 66.7 % (100 % up to encoder noise 10 µrad, 0 % beyond).")
+    scattered = {"motor__converged": lambda frame: frame["encoders.noise"] != 1e-5}
+    assert "up to" not in describe(make_result(rigid_study(axes=axes), **scattered)).headline
+
+
 def test_page_of_a_run_and_its_files(tmp_path):
     trial = run(small_study({"title": HOSTILE, "notes": [HOSTILE], "identifier.start": 10.0}))
     lines = write_report(trial, tmp_path).sentences
