@@ -125,7 +125,8 @@ ZERO_SPREAD = 1.8
 SPACING = 0.3
 """Prior standard deviation of the logarithm of a number about its trial value."""
 REACH = 4.0 * SPACING
-"""Change of that logarithm from which on another trial value would be nearer."""
+"""Change of that logarithm from which on another trial value would be nearer; above the largest, the log shows the number no
+longer."""
 
 
 def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callable[[str], Scales]) -> list[Candidate]:

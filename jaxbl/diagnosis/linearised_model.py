@@ -546,11 +546,14 @@ class Linear:
         return float(np.sqrt(products[-1, -1]))
 
     def shows(self, name: str, numbers: Numbers) -> bool:
-        """Tell whether the log can show an effect with these numbers: a gap wider than any twist, or contacts that bend over
-        more than the motion, is another effect."""
+        """Tell whether the log can show an effect with these numbers: a gap three times as wide as any twist, or contacts
+        that bend over a third of the motion, would look like another effect."""
         log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
-        shapes = {leaf: role for leaf, role in EFFECTS[name].roles().items() if role.kind == "shape"}
-        return all(numbers[leaf] <= np.exp(REACH) * max(role.trials(log)) for leaf, role in shapes.items())
+        return all(
+            numbers[leaf] <= np.exp(REACH) * max(role.trials(log), default=np.inf)
+            for leaf, role in EFFECTS[name].roles().items()
+            if role.kind == "shape"
+        )
 
     def torque_share(self, effect: AbstractEffect, *plain: AbstractEffect) -> float:
         """Torque of an effect along the log, less that of a plain law of it, rms over the driving torque's."""

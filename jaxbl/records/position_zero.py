@@ -103,11 +103,11 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     varies = varies[1:]
     # what does not repeat within the log, such as gravity over part of a turn, is no wave, and would be taken for one
     motion, slow = first_rows.columns[:, varies], slice(lowest_wave - 1)
-    columns = np.column_stack([motion, _find_basis(first_rows.waves[:, slow])])
-    waves, values = _find_waves(first_rows, columns, lowest_wave - 1)
+    beside = np.column_stack([motion, _find_basis(first_rows.waves[:, slow])])
+    waves, values = _find_waves(first_rows, beside, lowest_wave - 1)
     if not waves:
         return None
-    cosine, sine = values[columns.shape[1] :].reshape(-1, 2).T
+    cosine, sine = values[beside.shape[1] :].reshape(-1, 2).T
     # torque a_n cos(n q) + b_n sin(n q) = Re((a_n - i b_n) exp(i n q))
     size, harmonics = cosine - 1j * sine, np.array(waves) + 1
     shifts = np.linspace(-np.pi, np.pi, 2 * (_SHIFTS_PER_PERIOD * int(harmonics.max()) // 2), endpoint=False)

@@ -318,6 +318,7 @@ def drawn_values(part: DataFrame, value: str) -> Series:
 
 
 MARGINS = "margin_alpha", "margin_exact"
+"""Metrics of how far gains are from where α is no larger than f⁺, and from where the exact condition fails."""
 
 
 def worst_runs(groups: Groups, value: str) -> DataFrame:

@@ -246,7 +246,7 @@ def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
             [*(point["values"][path] for path in axes), result["best"] or "none", ", ".join(result["not_told_apart"]),
              *(_ratio(result["kinds"][kind]) for kind in kinds)]
             for point in points
-            if (result := point["sides"][side])
+            for result in [point["sides"][side]]
         ]  # fmt: skip
         columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
         tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))

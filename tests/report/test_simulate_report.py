@@ -4,7 +4,7 @@ import pytest
 from small_study import rigid_study, small_study
 
 from jaxbl.report.drawing import save
-from jaxbl.report.simulate import draw as draw_trial
+from jaxbl.report.simulate import describe, draw as draw_trial
 from jaxbl.sweeps.trial import run
 
 AT_REST = ["torque", "motor_velocity", "load_velocity", "hysteresis"]
@@ -40,3 +40,14 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
         for panel in d.panels:
             assert "(" in panel.y.label, d.name
         assert "(" in d.panels[-1].x.label or d.name.startswith("error_plane")
+
+
+@pytest.mark.parametrize(("lambda_", "verdict"), [(1e-3, "doubtful"), (4.0, "good")])
+def test_a_run_that_converges_is_good_only_if_the_exact_condition_ensures_it(lambda_, verdict):
+    """Both begin without an error, and stay small whatever the gains; the condition asks for about 0.006 √rad/s."""
+    start = {"run.duration": 2.0, "encoders.noise": 1e-6, "observer.motor.velocity_error": 0.0, "observer.motor.alpha": 3.0}
+    trial = run(rigid_study(start | {"observer.motor.lambda": lambda_}))
+    assert trial.summary["metrics"]["motor.converged"]
+    found = describe(trial)
+    assert found.verdict == verdict
+    assert ("the gains of the motor observer do not ensure that" in found.headline) == (verdict == "doubtful")

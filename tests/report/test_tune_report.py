@@ -15,7 +15,7 @@ from test_page import Page
 
 from jaxbl.config import read_config
 from jaxbl.gains.tune import tune
-from jaxbl.report.panels import Map
+from jaxbl.report.panels import Line, Map
 from jaxbl.report.results import describe, write_report
 from jaxbl.report.tune import _size, draw as draw_tuning
 from jaxbl.sweeps.trial import run
@@ -88,6 +88,12 @@ def test_map_has_the_coarse_stage_its_optimum_and_the_others(tuning):
     bound = tuning.summary["f_plus"]["motor"]
     assert [axis.ratio[0] for axis in (panel.x, panel.y)] == pytest.approx([bound, bound**0.5])
     assert {"not converged in time", "exact, ρ < 1", "usual rule", "config", "slow", "tuned"} <= {*names_of(panel)}
+    # nothing below the margins asked for, which lie above the exact condition
+    (dotted,) = (line for line in parts_of(panel, Line) if line.dashes == ":")
+    margins = tuning.summary["margins"]
+    assert np.min(dotted.x) == pytest.approx(margins["alpha"] * bound)
+    exact = part_named(panel, "exact, ρ < 1")
+    np.testing.assert_allclose(np.asarray(dotted.y)[1:], margins["exact"] * np.asarray(exact.y))
     # on the edge, not outside
     assert part_named(panel, "slow").held
 
