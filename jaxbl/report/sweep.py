@@ -54,7 +54,7 @@ def answer_sweep(result: StudyResult) -> Result:
         remarks.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
     for side, (best, runs) in survey.best.items():
         if best is None:
-            remarks.append(f"{side}: no gains converged in all runs and fulfil the exact condition.")
+            remarks.append(f"{side}: no gains converge in all runs and fulfil the exact condition.")
             continue
         remarks += [
             f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
