@@ -17,6 +17,7 @@ from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
@@ -107,7 +108,8 @@ def test_help_does_not_wait_for_jax(tmp_path):
 def test_a_sweep_and_its_second_call(tmp_path):
     """A user sees what is printed and left: no progress bar in a pipe, no work done twice."""
     write_study(tmp_path, rigid_study(axes=AXES, sweep={"seeds": 2}))
-    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    # programs are compiled anew; matplotlib says so where it takes long to list the fonts
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "MPLCONFIGDIR": matplotlib.get_cachedir()}
     first = jaxbl("sweep", "study.toml", cwd=tmp_path, **cache)
     assert (first.returncode, without_progress(first.stderr)) == (0, "")
     folder = tmp_path / "results" / "study_map"

@@ -47,9 +47,13 @@ def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]
     # where no gains work, none can be chosen
     if gains & {*study.axis_paths} and card.verdict != "failed":
         question = "Which gains have the least error, and are they better than the usual rule?"
-        steps.append(_propose(question, "tune", file, "--out", f"{folder}_gains"))
-    question = "What happens over time? One run, with the numbers that the study itself has."
-    return [*steps, _propose(question, "simulate", file, "--out", f"{folder}_run")]
+        steps.insert(0, _propose(question, "tune", file, "--out", f"{folder}_gains"))
+    steps += [
+        _propose(
+            "What happens over time? One run, with the study's own numbers.", "simulate", file, "--out", f"{folder}_run"
+        )
+    ]
+    return steps
 
 
 def after_run(card: "Result", config: Path) -> list[NextStep]:

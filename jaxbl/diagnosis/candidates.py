@@ -205,13 +205,11 @@ def _trial(name: str, fixed: Numbers, from_rest: bool) -> Candidate:
 
 
 def _effect(name: str, numbers: Numbers) -> AbstractEffect:
-    return _make_cached(name, *numbers.items())
+    return _make_cached(name, **numbers)
 
 
-@lru_cache(maxsize=4096)
-def _make_cached(name: str, *numbers: tuple[str, float]) -> AbstractEffect:
-    """Screening after screening asks for the same ones."""
-    return make_effect(name, **dict(numbers))
+_make_cached = lru_cache(maxsize=4096)(make_effect)
+"""Screening after screening asks for the same ones."""
 
 
 class Forces:
@@ -280,7 +278,9 @@ class MotionTorques:
         period = float(self.part.time[1] - self.part.time[0])
         # the share of the time around a sample in forward motion less that in backward motion
         step = np.maximum(np.abs(self.part.acceleration[side]) * period, np.finfo(float).tiny)
-        passage = np.clip(velocity / np.maximum(step, deviation), -1.0, 1.0)
+        # along a path that diverges
+        with np.errstate(over="ignore"):
+            passage = np.clip(velocity / np.maximum(step, deviation), -1.0, 1.0)
         moving = passage * (2.0 - np.abs(passage))
         held = self.held[side]
         if needed is None or not held.any():

@@ -108,7 +108,7 @@ def find_clock_skew(gearing: Gearing, grid: Grid, nominal: NominalDrive) -> Skew
     value = gearing.skew
     if (regression := _regress_twist(grid, nominal, value)) is not None:
         # without the wind-up by the shaft torque, from the motor's equation of motion
-        value += float(regression.values[1]) / nominal.gear_ratio
+        value += regression.values[1] / nominal.gear_ratio
     # friction takes something between nothing and all of it
     value = float(np.clip(value, gearing.skew - max_delay, gearing.skew))
     return Skew(value, float(np.hypot(gearing.skew_error, 0.5 * max_delay)), max_delay)
@@ -119,9 +119,9 @@ def max_windup_delay(grid: Grid, nominal: NominalDrive) -> float:
     work = square = 0.0
     for s in grid.segments if "u" in grid.values else ():
         velocity = np.gradient(grid.values["theta_e"][s], grid.period)
-        work += float(grid.values["u"][s] @ velocity)
-        square += float(velocity @ velocity)
-    return abs(work) / square / nominal.stiffness if square else math.inf
+        work += grid.values["u"][s] @ velocity
+        square += velocity @ velocity
+    return float(abs(work) / square / nominal.stiffness) if square else math.inf
 
 
 def find_encoder_offset(grid: Grid, nominal: NominalDrive) -> Offset | None:
@@ -199,8 +199,7 @@ def _regress_twist(grid: Grid, nominal: NominalDrive, skew: float = 0.0) -> _Reg
     def list_flanks() -> Flanks:
         for flank in (shaft_torque, velocity, acceleration):
             is_clear = np.abs(flank) > 0.3 * rms(flank)
-            share = np.mean(flank[is_clear] > 0.0) if is_clear.any() else 0.0
-            if np.mean(is_clear) >= 0.25 and 0.05 < share < 0.95:
+            if np.mean(is_clear) >= 0.25 and 0.05 < np.mean(flank[is_clear] > 0.0) < 0.95:
                 yield np.sign(flank), is_clear
 
     best = find_flank(target, terms, list_flanks())

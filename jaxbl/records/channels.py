@@ -82,7 +82,7 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         raise file.error(f"no column 'u'; {hint}; [log] u can name it, absent = [\"u\"] says that there is none")
     used_columns = {channel.column for channel in table.channels.values() if channel is not None}
     for column in file.columns:
-        is_similar = isinstance(column, str) and column.lower().replace("_", "").replace(" ", "") == name.replace("_", "")
+        is_similar = str(column).lower().replace("_", "").replace(" ", "") == name.replace("_", "")
         if is_similar and column not in used_columns:
             raise file.error(f"no column '{name}', but '{column}'; [log] {name} = \"{column}\" would read it")
     if table.kind == "drive":
@@ -104,7 +104,7 @@ def _read_numbers(
     signed_words = decode_words(table, values)
     is_no_word = np.isnan(signed_words)
     if is_no_word.any():
-        row = int(np.argmax(is_no_word))
+        row = np.argmax(is_no_word)
         bits, key = (table.signed_bits, "signed_bits") if table.sign_bit is None else (table.sign_bit + 1, "sign_bit")
         raise file.error(
             f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} is no word of {bits} bits; see [log] "
@@ -115,10 +115,14 @@ def _read_numbers(
 
 def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
     """Return the numbers of a column, of which words with a sign become signed; NaN for a value that is no such word."""
-    if table.sign_bit is None and table.signed_bits is None:
+    if table.sign_bit is not None:
+        limit = 2.0**table.sign_bit
+        least, negative = 0.0, limit - values
+    elif table.signed_bits is not None:
+        limit = 2.0 ** (table.signed_bits - 1)
+        least, negative = -limit, values - 2.0 * limit
+    else:
         return values
-    limit = 2.0 ** ((table.signed_bits or 0) - 1 if table.sign_bit is None else table.sign_bit)
-    least, negative = (-limit, values - 2.0 * limit) if table.sign_bit is None else (0.0, limit - values)
     is_word = (values == np.round(values)) & (values >= least) & (values < 2.0 * limit)
     return np.where(is_word, np.where(values >= limit, negative, values), np.nan)
 
@@ -169,7 +173,7 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
 def _read_reference(file: LogFile, table: PositionTable, stamps: TimeStamps) -> RawChannel:
     """Read what a controller was given: it may stand still or jump."""
     values = _read_numbers(file, "reference", table, stamps)
-    values = to_si(table, values if table.wrap is None else _unwrap(file, "reference", table, values))
+    values = to_si(table, _unwrap(file, "reference", table, values))
     return RawChannel(values, table.si_unit, table.skew or 0.0)
 
 
@@ -205,7 +209,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
         size = np.abs(values)
         # the margins are for the rounding of decimal numbers
         if size.max() > table.saturation * (1.0 + 1e-9):
-            row = int(np.argmax(size))
+            row = np.argmax(size)
             raise file.error(
                 f"column {column!r}, data row {stamps.rows[row] + 1}: {values[row]:g} exceeds [log] {name}.saturation = "
                 f"{table.saturation:g}; saturation should be the largest possible value"
@@ -271,34 +275,35 @@ def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: floa
     jumps = np.zeros(len(sizes))
     for row in np.flatnonzero(np.abs(sizes) > 0.9 * _MIN_COUNTER):
         power = 2.0 ** round(math.log2(abs(sizes[row])))
-        tolerance = 2.0 + 3.0 * float(np.median(np.abs(sizes[max(row - 4, 0) : row + 5])))
+        tolerance = 2.0 + 3.0 * np.median(np.abs(sizes[max(row - 4, 0) : row + 5]))
         # one of another size, and all are of another cause
         if not (power <= _MAX_COUNTER and abs(abs(sizes[row]) - power) < tolerance < _MAX_TOLERANCE * power):
             return values
         jumps[row] = math.copysign(power, sizes[row])
     rows = np.flatnonzero(jumps)
-    if not len(rows) or len(rows) > 0.01 * len(values):
+    if not 0 < len(rows) <= 0.01 * len(values):
         return values
     texts = [f"{jumps[row]:+.0f} (data row {stamps.rows[row + 1] + 1})" for row in rows[:6]]
     file.warnings.append(
         f"{name}: {len(rows)} counter jump{'s' * (len(rows) > 1)}, in steps of {step:.4g}: {', '.join(texts)}"
         f"{', ...' * (len(rows) > 6)}. They were undone."
     )
-    return values - step * np.cumsum(np.concatenate([[0.0], jumps]))
+    return values - step * np.cumsum(np.append(0.0, jumps))
 
 
 # wrap-around
 
 
 def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
-    assert table.wrap is not None
+    if table.wrap is None:
+        return values
     if np.ptp(values) > 1.001 * table.wrap:
         raise file.error(
             f"column {table.column_or(name)!r} ranges over {np.ptp(values):g}, more than [log] {name}.wrap = "
             f"{table.wrap:g}; wrap should be the period after which it starts again"
         )
     unwrapped = np.unwrap(values, period=table.wrap)
-    count = int(np.count_nonzero(np.abs(np.diff(unwrapped) - np.diff(values)) > 0.5 * table.wrap))
+    count = np.count_nonzero(np.abs(np.diff(unwrapped) - np.diff(values)) > 0.5 * table.wrap)
     if count:
         file.notes.append(f"{name}: {count} wrap-arounds undone.")
     return unwrapped
@@ -307,11 +312,11 @@ def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) 
 def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray, stamps: TimeStamps) -> None:
     """Refuse values that are smooth but for a few jumps by a common period (a turn, or a counter's range)."""
     steps = np.abs(np.diff(values))
-    span = float(np.ptp(values))
+    span = np.ptp(values)
     jump_rows = np.flatnonzero(steps > 0.75 * span)
-    if not len(jump_rows) or len(jump_rows) > 0.1 * len(values):
+    if not 0 < len(jump_rows) <= 0.1 * len(values):
         return
-    usual_step = float(np.quantile(np.delete(steps, jump_rows), 0.999))
+    usual_step = np.quantile(np.delete(steps, jump_rows), 0.999)
     # a turn in each unit, and counters of 3 to 32 bits
     periods = [2.0 * math.pi, 360.0, 1.0, *(2.0**k for k in range(3, 33)), table.counts_per_turn or 360.0]
     # without its jump by a period the motion goes on as before

@@ -193,26 +193,26 @@ class _Rig:
         """Return where the position has dragged what follows it at a distance of at most `reach`, shape (samples,)."""
         dragged, last = np.zeros(len(self.position)), 0.0
         for part, begins in self.stretches:
-            forward = float(self.direction[part.start])
+            forward = self.direction[part.start]
             # how it was wound up before is unknown: not at all errs least
             last = self.position[part.start] if begins else last
             ahead = np.maximum.accumulate(forward * self.position[part]) - reach
             dragged[part] = forward * np.maximum(ahead, forward * last)
-            last = float(dragged[part.stop - 1])
+            last = dragged[part.stop - 1]
         return dragged
 
     def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
         h, last = np.zeros(len(deflection)), 0.0
         for part, begins in self.stretches:
-            forward = float(self.direction[part.start])
+            forward = self.direction[part.start]
             before = deflection[part.start - (not begins)]
             way = np.maximum(forward * (deflection[part] - before), 0.0) / length
             w = 0.0 if begins else forward * last
             rise = np.tanh(np.maximum(way + min(w, 0.0), 0.0))
             base = max(w, 0.0)
             h[part] = forward * np.where(w + way < 0.0, w + way, (base + rise) / (1.0 + base * rise))
-            last = float(h[part.stop - 1])
+            last = h[part.stop - 1]
         return h
 
 
@@ -267,7 +267,7 @@ def _prepare_rig(log: RigLog) -> _Rig | None:
     for s in segments:
         smooth[s] = low_pass(position[s], cutoff, period)
         rate[s] = np.gradient(smooth[s], period)
-        turns = _find_reversals(smooth[s], max(_REVERSAL_NOISE * noise * share, 1e-6 * float(np.ptp(position))))
+        turns = _find_reversals(smooth[s], max(_REVERSAL_NOISE * noise * share, 1e-6 * np.ptp(position)))
         parts = slices_between([s.start, *(s.start + index + 1 for index in turns), s.stop])
         for part in parts:
             travel = smooth[part.stop - 1] - smooth[max(part.start - 1, s.start)]
@@ -280,7 +280,7 @@ def _prepare_rig(log: RigLog) -> _Rig | None:
     rows = np.concatenate(fitted_rows)
     if len(rows) < MIN_SAMPLES or np.ptp(torque[rows]) == 0.0 or np.ptp(smooth[rows]) == 0.0:
         return None
-    blur = np.abs(rate) * period + 4.0 * noise + 1e-9 * float(np.ptp(smooth))
+    blur = np.abs(rate) * period + 4.0 * noise + 1e-9 * np.ptp(smooth)
     return _Rig(position, rate, blur, direction, stretches, rows, torque)
 
 
@@ -376,7 +376,7 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
     from scipy.optimize import least_squares
 
     names = _shape_names(terms)
-    half, middle = rig.half_range, 0.5 * (float(rig.position.min()) + float(rig.position.max()))
+    half, middle = rig.half_range, 0.5 * (rig.position.min() + rig.position.max())
     near_shapes = dict(zip(_shape_names(near.terms), near.shapes, strict=True)) if near is not None else {}
 
     def scale_shapes(name: str, shares: tuple[float, ...]) -> list[float]:
@@ -414,7 +414,7 @@ def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
     Logarithms are compared: a term may matter a hundred times as much in one block as in another.
     """
     gains = np.log(_held_out_errors(rig, without) / _held_out_errors(rig, model))
-    mean = float(np.mean(gains))
+    mean = np.mean(gains)
     return math.expm1(mean) if mean > _SURE_ERRORS * mean_error(gains) else None
 
 

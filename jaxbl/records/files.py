@@ -162,14 +162,14 @@ class LogFile:
             texts = pd.Series(stamps).astype(str).str.replace(",", ".")
             if pd.to_numeric(texts, errors="coerce").isna().all() and texts.str.contains(r"\d[:/-]\d").any():
                 stamps = pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).dt.tz_convert(None).to_numpy()
-        if stamps.dtype.kind in "iu" and unit == _NANOSECOND and len(stamps) and stamps.max() > _EXACT:
+        if stamps.dtype.kind in "iu" and unit == _NANOSECOND and stamps.max(initial=0) > _EXACT:
             stamps, unit = stamps.astype("M8[ns]"), 1.0
         if stamps.dtype.kind not in "Mm":
             return self.load_numbers(column, channel) * unit
         if unit != 1.0:
             raise self.error(f"column {name!r} holds dates or times, which have their own unit; remove [log] t.unit")
         if np.isnat(stamps).any():
-            row = int(np.argmax(np.isnat(stamps))) + 1
+            row = np.argmax(np.isnat(stamps)) + 1
             raise self.error(f"column {name!r}, data row {row} is no time, or empty")
         if stamps.dtype.kind == "M" and len(stamps):
             self.notes.append(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
@@ -194,7 +194,7 @@ class LogFile:
         values = np.asarray(pd.to_numeric(pd.Series(cells), errors="coerce"), dtype=float)
         is_finite = np.abs(values) <= LARGEST
         if not is_finite.all():
-            row = int(np.argmin(is_finite))
+            row = np.argmin(is_finite)
             cell, place = np.asarray(cells, dtype=object)[row], f"column {name!r}, data row {rows[row] + 1} is"
             if np.isfinite(values[row]):
                 raise self.error(f"{place} {values[row]:g}; a reading should be below {LARGEST:g}")
@@ -285,16 +285,17 @@ def _read_columns(path: Path, selection: Selection) -> Columns:
     for first_bytes, remedy in _REMEDIES.items():
         if head.startswith(first_bytes):
             raise InputError(remedy)
+    read_as = partial(_read_text, path, head, is_complete, selection)
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         # Excel and LabVIEW
-        return _read_text(path, head, "utf-16", is_complete, selection)
+        return read_as("utf-16")
     if b"\0" in head:
         raise InputError(f"is not a log of a known kind; {_READABLE_KINDS}")
     try:
-        return _read_text(path, head, "utf-8-sig", is_complete, selection)
+        return read_as("utf-8-sig")
     except UnicodeDecodeError:
         # a degree sign in a header of an old program
-        return _read_text(path, head, "latin-1", is_complete, selection)
+        return read_as("latin-1")
 
 
 _REMEDIES = {
@@ -310,19 +311,17 @@ _REMEDIES = {
 def _read_with_installed_reader(path: Path, suffix: str) -> Columns:
     with _report_errors(f"a log by the reader of .{suffix} files"):
         result = READERS[suffix](path)
-    try:
+    with suppress(TypeError, ValueError):
         columns = result if isinstance(result, Columns) else Columns(result)
-        is_valid = all(isinstance(name, str) for name in columns) and all(
-            isinstance(values, Column) or np.ndim(values) == 1 for values in columns.values()
-        )
-    except (TypeError, ValueError):
-        is_valid = False
-    if not is_valid:
-        raise InputError(f"the reader of .{suffix} files should give columns of one dimension by name")
-    return columns
+        if all(
+            isinstance(name, str) and (isinstance(values, Column) or np.ndim(values) == 1)
+            for name, values in columns.items()
+        ):
+            return columns
+    raise InputError(f"the reader of .{suffix} files should give columns of one dimension by name")
 
 
-def _read_text(path: Path, start: bytes, encoding: str, is_complete: bool, selection: Selection) -> Columns:
+def _read_text(path: Path, start: bytes, is_complete: bool, selection: Selection, encoding: str) -> Columns:
     """Read JSON or a table. `start` is the beginning of the file, or all of it (`is_complete`)."""
     # whole lines and letters
     head = getincrementaldecoder(encoding)().decode(start, is_complete)
@@ -447,10 +446,7 @@ def _read_table(path: Path, lines: list[str], encoding: str, selection: Selectio
     if not count:
         raise InputError(_NO_ROWS)
     columns = Columns(
-        {
-            name: values[name] if name in values else Column(lambda name=name: load_rows([name])[1][name], count)
-            for name in names
-        }
+        {name: values.get(name, Column(lambda name=name: load_rows([name])[1][name], count)) for name in names}
     )
     if headers:
         columns.notes.append(f"{len(headers)} rows that repeat the header are left out (data row {headers[0] + 1} first).")
@@ -500,7 +496,7 @@ def _parse_number(cell: str) -> float:
 
 def has_cells(line: str) -> bool:
     """Return True if a line is neither blank nor a comment."""
-    return bool(line.strip()) and not line.lstrip().startswith("#")
+    return line.strip()[:1] not in ("", "#")
 
 
 def detect_text_format(lines: list[str]) -> TextFormat:
@@ -583,8 +579,15 @@ def _read_after_remarks(lines: list[str], load_text: Callable[[], str]) -> Colum
         return None
     rows = [line for line in load_text().splitlines()[start:] if line.strip() and line.strip() != "EOF"]
     decimal, thousands = _find_number_signs(rows, separator)
-    signs: Any = {"sep": separator, "decimal": decimal, "thousands": thousands}
-    frame = pd.read_csv(io.StringIO("\n".join(rows)), header=None, skipinitialspace=True, index_col=False, **signs)
+    frame = pd.read_csv(
+        io.StringIO("\n".join(rows)),
+        sep=separator,
+        header=None,
+        skipinitialspace=True,
+        decimal=decimal,
+        thousands=thousands,
+        index_col=False,
+    )
     titles = [cells[:count] for cells in titles if len(cells) >= count]
     scope_names = [cells for cells in titles if cells[0] == "Name"]
     names, units, *_ = [*(scope_names[-1:] or titles[-2:]), [], []]
@@ -675,7 +678,7 @@ def _read_json(text: str) -> Columns:
 
 def _is_matrix(value: Any) -> bool:
     """Return True for a list of rows of equally many numbers."""
-    if not isinstance(value, list) or not value or not all(isinstance(row, list) and row for row in value):
+    if not isinstance(value, list) or not all(isinstance(row, list) and row for row in value):
         return False
     has_numbers = all(isinstance(cell, int | float) or cell is None for row in value for cell in row)
     return has_numbers and len({len(row) for row in value}) == 1
@@ -762,11 +765,9 @@ def _list_matlab_variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]
 def _add_vectors(columns: Columns, name: str, shape: tuple[int, ...], load: Callable[[], Any]) -> None:
     """Add a vector, or the columns of a matrix, whose values `load` returns; lengths of 1 in `shape` do not count."""
     shape = tuple(length for length in shape if length != 1)
-    if len(shape) == 2 and min(shape) > _MAX_COLUMNS:
-        return
     if len(shape) == 1:
         columns[name] = Column(lambda: np.squeeze(load()), shape[0])
-    elif len(shape) == 2:
+    elif len(shape) == 2 and min(shape) <= _MAX_COLUMNS:
         # samples run along the longer side
         axis = 1 if shape[0] >= shape[1] else 0
         for i in range(shape[axis]):

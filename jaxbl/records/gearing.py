@@ -100,7 +100,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     fit = _fit_with_skew(grid, width) if width and usable else None
     if fit is None:
         return None
-    target, rows, coefficients, errors, skew, has_skew = fit
+    (target, rows, coefficients, errors), skew, has_skew = fit
     # the ratio is that of the whole motion, with the parts that repeat within it
     slopes, slope_errors = _fit_terms(target, rows[:, :4])
     residuals, slope = target - rows[:, :4] @ slopes, float(slopes[0])
@@ -109,7 +109,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     # encoders are not late by many periods, and at a constant speed, to and fro, a delay looks like lost motion
     velocity, flank = rows[:, 1:3].T
     speed = _rms(velocity)
-    correlation = abs(float(velocity @ flank)) / (len(rows) * speed * _rms(flank))
+    correlation = abs(velocity @ flank) / (len(rows) * speed * _rms(flank))
     has_skew = has_skew and residual < UNRELATED and abs(skew) < 10.0 * period and correlation < 0.97
     # only a significant skew is undone
     undone_skew = skew if has_skew and abs(skew) > 4.0 * errors[1] / abs(coefficients[0]) else 0.0
@@ -127,7 +127,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     if lost_motion_fit is None:
         # no flank is in contact for long: the rough regression has to do
         lost_motion_fit = LostMotion.from_motion(
-            2.0 * float(coefficients[2]) * float(np.sign(coefficients[0])), 2.0 * float(errors[2])
+            float(2.0 * coefficients[2] * np.sign(coefficients[0])), 2.0 * float(errors[2])
         )
     # the crossing of the gap is not modelled: an error of 0.5 % of the gap, by motions of several frequencies
     skew_error = float(np.hypot(errors[1], 0.005 * lost_motion_fit.lost_motion / speed) / abs(coefficients[0]))
@@ -146,7 +146,11 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     )
 
 
-def _fit_with_skew(grid: Grid, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, bool] | None:
+_MotorFit = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Results of :func:`_regress_motor`."""
+
+
+def _fit_with_skew(grid: Grid, width: float) -> tuple[_MotorFit, float, bool] | None:
     """Repeat :func:`_regress_motor` until the skew of the load converges.
 
     Returns:
@@ -166,7 +170,7 @@ def _fit_with_skew(grid: Grid, width: float) -> tuple[np.ndarray, np.ndarray, np
         if abs(skew) > 0.25 / width:
             skew, has_skew = 0.0, False
     assert fit is not None
-    return *fit, skew, has_skew
+    return fit, skew, has_skew
 
 
 @dataclass(frozen=True)
@@ -199,7 +203,7 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
     if constant is None:
         return None
     drift, fit, error, reach = 0.0, constant, np.inf, 0.0
-    half = 0.5 * float(grid.time[-1] - grid.time[0])
+    half = 0.5 * (grid.time[-1] - grid.time[0])
     # converges quadratically, as the skew does
     for _ in range(6):
         fit = _regress_motor(grid, 4.0 * width, skew, drift)
@@ -218,7 +222,7 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
         BlockRegression.of(target - rows @ values, rows, _FOLDS).held_out() for target, rows, values, _ in (constant, fit)
     )
     gains = np.log(before / after)
-    better = float(np.mean(gains)) > 2.0 * mean_error(gains)
+    better = np.mean(gains) > 2.0 * mean_error(gains)
     if not better or abs(drift) < 6.0 * abs(error) or reach < 0.05 * period:
         return None
     return Drift(drift, abs(error), reach)
@@ -262,7 +266,7 @@ def _fit_lost_motion(
     ends = np.cumsum([part.shape[1] for part in parts])[:-1]
     rows = [np.ones_like(position), velocity, acceleration]
     if not is_wide:
-        way, span = position - position.min(), float(np.ptp(position))
+        way, span = position - position.min(), np.ptp(position)
         repeats = span > 1.5 * turn
         phases = _count_phases(way * (2.0 * np.pi / turn if repeats else np.pi / span))
         rows += [way, np.cos(phases), *([np.sin(phases)] if repeats else [])]
@@ -321,7 +325,7 @@ def find_flank(target: np.ndarray, terms: np.ndarray, flanks: Flanks) -> tuple[n
     """Find the flanks that explain most of a target beside other terms; None if too few samples are clear of the gap."""
     best = None
     for flank, is_clear in flanks:
-        sample = np.flatnonzero(is_clear)[:: max(int(is_clear.sum()) // 20_000, 1)]
+        sample = np.flatnonzero(is_clear)[:: max(is_clear.sum() // 20_000, 1)]
         if len(sample) >= 3 * terms.shape[1] and is_clear.sum() >= 0.1 * len(is_clear):
             residual = rms(fit_residual(target[sample], np.column_stack([flank[sample], terms[sample]])))
             if best is None or residual < best[0]:
@@ -332,13 +336,11 @@ def find_flank(target: np.ndarray, terms: np.ndarray, flanks: Flanks) -> tuple[n
 def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics | None) -> float:
     """Return the rms noise and resolution of both encoders together, or of one, at the motor, in their unit."""
     encoders = [(1.0, motor)] if load is None else [(1.0, motor), (ratio, load)]
-    noise = [factor * encoder.noise for factor, encoder in encoders]
-    return float(np.hypot.reduce([*noise, *(factor * encoder.resolution / 12.0**0.5 for factor, encoder in encoders)]))
+    sizes = [(factor * encoder.noise, factor * encoder.resolution / 12.0**0.5) for factor, encoder in encoders]
+    return float(np.linalg.norm(sizes))
 
 
-def _regress_motor(
-    grid: Grid, cutoff: float, skew: float, drift: float | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+def _regress_motor(grid: Grid, cutoff: float, skew: float, drift: float | None = None) -> _MotorFit | None:
     """Regress motor on load position for :func:`fit_gearing`, at a skew (s) and a drift (s/s) about the middle of the log.
 
     Returns:
@@ -346,7 +348,7 @@ def _regress_motor(
         terms of the series, and with a `drift` velocity times time. Coefficients and standard errors, shape (terms,).
     """
     period, load = grid.period, grid.values["theta_s"]
-    middle = 0.5 * float(grid.time[0] + grid.time[-1])
+    middle = 0.5 * (grid.time[0] + grid.time[-1])
     parts = []
     for s in long_segments(grid.segments):
         times, offset = grid.time[s], grid.time[s] - middle

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from .element import SIZE_NAMES, Element, RigLog, fit_element
 from .gearing import Gearing, twist_noise
 from .least_squares import fit_with_jackknife, rms
 from .reader import Record, read_log_table, read_record
+from .rigid_body import RigidFit, fit_rigid_drive, smooth_sign
 from .signal_quality import low_pass, low_pass_motion
 from .table import POSITION_CHANNELS, LogTable
 
@@ -130,7 +131,7 @@ def inspect(
         ratio = None
     speed = compute_velocity(record)
     reversals = _count_reversals(record, speed)
-    judgements = _judge_rigid_drive(record, speed, reversals) + _judge_transmission(record, speed, reversals, ratio)
+    judgements = _judge_rigid_drive(record, speed) + _judge_transmission(record, speed, reversals, ratio)
     return Inspection(record, table, ratio, reversals, tuple(judgements))
 
 
@@ -202,58 +203,87 @@ def _judge_alike(quantities: Iterable[str], answer: _Answer, reason: str) -> lis
     return [Identifiability(quantity, answer, reason) for quantity in quantities]
 
 
-def _judge_rigid_drive(record: Record, speed: np.ndarray, reversals: int) -> list[Identifiability]:
-    names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
-    torque, rigid_fit = record.torque, record.statistics.dynamics
+_FRICTIONS = "viscous friction", "Coulomb friction"
+_INSEPARABLE = 10.0
+"""Variance inflation factor from which on a term is hardly told from others: nine tenths of it are in them."""
+
+
+def _judge_rigid_drive(record: Record, speed: np.ndarray) -> list[Identifiability]:
+    names = ("inertia", *_FRICTIONS, "constant torque")
+    torque, gearing = record.torque, record.statistics.gearing
     if torque is None:
         return _judge_alike(names, "no", "no torque was recorded: the log shows kinematics only")
     if np.ptp(torque) == 0.0:
         reason = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
         return _judge_alike(names, "weak", reason)
+    if record.statistics.dynamics is None:
+        return _judge_alike(names, "no", "the motion does not exceed the noise")
+    share = _minor_share(speed)
+    constant = Identifiability(names[3], "yes", f"motion in both directions ({100 * share:.0f} % in the less frequent one)")
+    if share < _ONE_WAY:
+        constant = Identifiability(names[3], "weak", f"{_ONE_DIRECTION} {names[2]}")
+    if gearing is None or not gearing.is_loose:
+        return [*_judge_motion(record, record.statistics.dynamics, main_side(record)), constant]
+    # the torque moves both sides, whatever lies between them
+    fits = {side: _fit_side(record, side) for side in POSITION_CHANNELS}
+    return [judgement for side, fit in fits.items() for judgement in _judge_motion(record, fit, side, f"{side} ")] + [
+        constant
+    ]
+
+
+def _fit_side(record: Record, side: str) -> RigidFit | None:
+    """Fit the torque to the motion of a side, that of the other one beside it."""
+    assert record.torque is not None
+    (other,) = record.positions.keys() - {side}
+    return fit_rigid_drive(
+        record.torque, record.positions[side], record.segments, record.sample_period, record.positions[other]
+    )
+
+
+_ONE_WAY, _ONE_DIRECTION = 0.05, "motion in one direction only: hard to separate from"
+"""Share of the motion in the less frequent direction that is too little, and what is said then."""
+
+
+def _minor_share(speed: np.ndarray) -> float:
+    moving = speed[_is_moving(speed)]
+    return float(min((moving > 0).mean(), (moving < 0).mean()))
+
+
+def _judge_motion(record: Record, rigid_fit: RigidFit | None, side: str, lead: str = "") -> list[Identifiability]:
+    """Judge inertia and frictions by a fit of the torque to the motion of a side; `lead` begins their names."""
+    inertia, viscous, coulomb = names = [f"{lead}{name}" for name in ("inertia", *_FRICTIONS)]
     if rigid_fit is None:
         return _judge_alike(names, "no", "the motion does not exceed the noise")
-    moving = speed[_is_moving(speed)]
-    slow, fast = np.quantile(np.abs(moving), [0.05, 0.95])
-    minor_share = min((moving > 0).mean(), (moving < 0).mean())
-    width = record.statistics.channels[POSITION_CHANNELS[main_side(record)]].bandwidth
+    speed = compute_velocity(record, side)
+    slow, fast = np.quantile(np.abs(speed[_is_moving(speed)]), [0.05, 0.95])
+    width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
 
     def judge(name: str, i: int, evidence: str, similar_term: str) -> Identifiability:
         value, error, inflation, share = (
             float(x[i]) for x in (rigid_fit.values, rigid_fit.errors, rigid_fit.inflation, rigid_fit.shares)
         )
         percent, weakness = f"{100 * share:.0f} % of the torque", ""
-        if inflation > 10.0:
+        if inflation > _INSEPARABLE:
             weakness = f"hard to separate from {similar_term} here (variance × {inflation:.0f})"
-        elif value < 2.0 * error:
-            weakness = f"a rough fit finds no positive value ({percent}): other effects hide it"
         elif share < 0.05:
             weakness = f"it makes only {percent}"
+        elif value < 2.0 * error:
+            weakness = f"a rough fit finds no positive value ({percent}): other effects hide it"
         elif error > 0.2 * abs(value):
             weakness = f"a rough fit finds it only to ± {100 * error / value:.0f} % ({percent})"
         return Identifiability(name, "weak" if weakness else "yes", weakness or f"{evidence}: {percent}")
 
-    inertia, *friction = names[:3]
-    constant = Identifiability(
-        names[3], "yes", f"motion in both directions ({100 * minor_share:.0f} % in the less frequent one)"
-    )
     speeds = f"speeds of {slow:.3g} to {fast:.3g}"
     judgements = [
         judge(inertia, 0, f"motion up to {width:.3g} Hz", "a spring or gravity"),
-        judge(friction[0], 1, speeds, friction[1]),
-        judge(friction[1], 2, f"{reversals} reversals", friction[0]),
+        judge(viscous, 1, speeds, _FRICTIONS[1]),
+        judge(coulomb, 2, f"{_count_reversals(record, speed)} reversals", _FRICTIONS[0]),
     ]
-    if minor_share < 0.05:
-        text = "motion in one direction only: hard to separate from"
-        judgements[2] = Identifiability(friction[1], "weak", f"{text} a constant torque")
-        constant = Identifiability(names[3], "weak", f"{text} {friction[1]}")
+    if _minor_share(speed) < _ONE_WAY:
+        judgements[2] = Identifiability(coulomb, "weak", f"{_ONE_DIRECTION} a constant torque")
     if fast < 1.5 * slow:
-        reason = f"{speeds} are too close to separate viscous from Coulomb friction"
-        judgements[1:] = _judge_alike(friction, "weak", reason)
-    gearing = record.statistics.gearing
-    if gearing is not None and gearing.is_loose:
-        doubt = "by a fit of a rigid drive, while here the load follows the motor only loosely"
-        judgements = [replace(judgement, answer="weak", reason=f"{judgement.reason}; {doubt}") for judgement in judgements]
-    return [*judgements, constant]
+        judgements[1:] = _judge_alike(names[1:], "weak", f"{speeds} are too close to separate viscous from Coulomb friction")
+    return judgements
 
 
 def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Identifiability]:
@@ -276,23 +306,45 @@ def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio
     answer = "yes" if gearing.residual < 0.05 and not gearing.is_loose else "weak"
     return [
         Identifiability("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {remark}"),
-        _judge_lost_motion(gearing, reversals, noise, channels["theta_e"].unit),
+        _judge_lost_motion(record, gearing, reversals, ratio, noise),
         Identifiability("stiffness", *_judge_stiffness(record, speed, ratio, noise)),
     ]
 
 
-def _judge_lost_motion(gearing: Gearing, reversals: int, noise: float, unit: str) -> Identifiability:
+def _judge_lost_motion(record: Record, gearing: Gearing, reversals: int, ratio: float, noise: float) -> Identifiability:
+    unit = record.statistics.channels["theta_e"].unit
     size = gearing.describe_lost_motion(unit)
     answer, reason = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
     if gearing.flank == "load":
         answer, reason = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
     elif reversals < 2:
         answer, reason = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
+    elif gearing.is_loose and (half := _find_loose_gap(record, ratio, noise)) > max(noise, _BLURRED * gearing.twist):
+        answer, reason = "yes", f"the torque in the gear over the twist shows a half gap of about {half:.2g} {unit}"
     elif gearing.is_loose:
         reason = f"shift of {size} includes the wind-up, which this motion does not separate"
     elif gearing.exceeds_noise(noise):
         answer, reason = "yes", f"theta_e shifts by {size} from flank to flank"
     return Identifiability("lost motion", answer, reason)
+
+
+_BLURRED = 0.01
+"""Half gap over the range of the twist that low-passed corners may make where there is none."""
+
+
+def _find_loose_gap(record: Record, ratio: float, noise: float) -> float:
+    """Roughly find the half gap, rad (m), from the twist and what the motor's own inertia and friction leave of the torque;
+    0 where these show none."""
+    torque, period = record.torque, record.sample_period
+    fit = None if torque is None else _fit_side(record, "motor")
+    if torque is None or fit is None or fit.inflation[0] > _INSEPARABLE:
+        return 0.0
+    cutoff = 4.0 * record.statistics.channels["theta_e"].bandwidth
+    motion = [low_pass_motion(record.positions["motor"][segment], cutoff, period)[1:] for segment in record.segments]
+    velocity, acceleration = np.concatenate(motion, axis=1)
+    through = torque - fit.values[:3] @ np.stack([acceleration, velocity, smooth_sign(velocity)])
+    gear = fit_element(RigLog(compute_twist(record, ratio), through, record.segments, period, noise), linear=False)
+    return 0.0 if gear is None or "half_gap" in gear.open or "gap" not in gear.terms else gear.numbers["half_gap"].value
 
 
 def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> tuple[_Answer, str]:

@@ -120,12 +120,12 @@ def _fit_lateness(
     unexplained[:, rows] = target - regressors @ values, fit_residual(slope, regressors[:, :-1])
     missing, own_slope = welch(unexplained, nperseg=min(2048, len(rows) // 4))[1]
     # a torque that the columns lack hides in the slope at most what it leaves at the slope's frequencies
-    missing_error = float(np.sum(np.sqrt(missing * own_slope)) / np.sum(own_slope))
+    missing_error = np.sum(np.sqrt(missing * own_slope)) / np.sum(own_slope)
     accelerating_torque = regressors[:, :encoder_count] @ values[:encoder_count]
     inertia = rms(accelerating_torque) / rms(regressors[:, 0])
     # friction f of a load J_s on a shaft K delays it by f / K; J_s² / K is the coefficient of the snap
     velocity = regressors[:, encoder_count + 2]
-    friction = max(float(target @ velocity / (velocity @ velocity)), 0.0)
+    friction = max(target @ velocity / (velocity @ velocity), 0.0)
     windup_error = 2.0 * (abs(values[encoder_count]) + errors[encoder_count]) * friction / inertia**2
     error = float(np.linalg.norm([errors[-1], missing_error, windup_error]))
     # a torque that is held for a period acts half a period after its stamp

@@ -119,8 +119,7 @@ def fit_with_jackknife(target: np.ndarray, regressors: np.ndarray) -> tuple[np.n
 
 def jackknife_variance(without: np.ndarray | Sequence[float]) -> np.ndarray:
     """Return the variance of estimates, each of them without one of the blocks of a log."""
-    deviations = np.array(without) - np.mean(without, axis=0)
-    return (len(deviations) - 1) / len(deviations) * np.sum(deviations**2, axis=0)
+    return (len(without) - 1) * np.var(without, axis=0)
 
 
 def fit_residual(target: np.ndarray, regressors: np.ndarray) -> np.ndarray:

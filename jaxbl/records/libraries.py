@@ -73,14 +73,14 @@ def read_at(times: np.ndarray, own_times: np.ndarray, values: Any) -> np.ndarray
     return np.interp(times, own_times[is_finite], values[is_finite], left=np.nan, right=np.nan)
 
 
-def _import_library(name: str, kind: str, package: str = "") -> Any:
+def _import_library(name: str, kind: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise InputError(f"is {kind}, which needs the package {package or name}: pip install 'jaxbl[logs]'") from None
+        raise InputError(f"is {kind}, which needs the package {name.split('.')[0]}: pip install 'jaxbl[logs]'") from None
 
 
-def read_tdms(path: Path, _: Selection = ()) -> Columns:
+def read_tdms(path: Path, _: Selection) -> Columns:
     """Read channels of a TDMS file by name, by `group/channel` if a name occurs twice; `t` from their increment, s."""
     library = _import_library("nptdms", "TDMS")
     channels = [channel for group in library.TdmsFile.read_metadata(path).groups() for channel in group.channels()]
@@ -102,7 +102,7 @@ def read_tdms(path: Path, _: Selection = ()) -> Columns:
     return columns
 
 
-def read_mdf(path: Path, _: Selection = ()) -> Columns:
+def read_mdf(path: Path, _: Selection) -> Columns:
     """Read channels of an MDF file by name; `t` are the times of the group with the most samples, s.
 
     Channels of other groups, which have their own times, are interpolated to these.
@@ -145,9 +145,9 @@ def name_members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-def read_mcap(path: Path, selection: Selection = ()) -> Columns:
+def read_mcap(path: Path, selection: Selection) -> Columns:
     """Read an MCAP file with messages in JSON or of ROS 2; columns are those of :func:`read_bag`."""
-    library = _import_library("mcap.reader", "MCAP", "mcap")
+    library = _import_library("mcap.reader", "MCAP")
     with path.open("rb") as file:
         summary = library.make_reader(file, validate_crcs=True).get_summary()
     if summary is None or summary.statistics is None:
@@ -178,7 +178,7 @@ def read_mcap(path: Path, selection: Selection = ()) -> Columns:
 
 def _message_types(schema: Any) -> Any:
     """Return the type store that decodes the messages of a schema."""
-    library = _import_library("rosbags.typesys", "MCAP with messages of ROS 2", "rosbags")
+    library = _import_library("rosbags.typesys", "MCAP with messages of ROS 2")
     store = library.get_typestore(library.Stores.EMPTY)
     text = schema.data.decode()
     store.register(
@@ -187,13 +187,13 @@ def _message_types(schema: Any) -> Any:
     return store
 
 
-def read_bag(path: Path, selection: Selection = ()) -> Columns:
+def read_bag(path: Path, selection: Selection) -> Columns:
     """Read numbers in the messages of a ROS bag by topic and field, as `/joint_states.position[arm]`; `t` is their time, s.
 
     A time is the stamp in the message's header, or the time of recording if there is none. Among the topics of the
     `selection` the one with the most messages gives the times; the others are interpolated to them.
     """
-    library = _import_library("rosbags.highlevel", "a ROS bag", "rosbags")
+    library = _import_library("rosbags.highlevel", "a ROS bag")
     with library.AnyReader([path]) as reader:
         counts = Counter[str]()
         for connection in reader.connections:

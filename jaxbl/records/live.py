@@ -296,11 +296,11 @@ class Stream:
                 f"{self.source.name}: most rows have the time stamp of the row before; stamps should be finer than the "
                 "sampling period, or [log] t = { period = ... } says that there are none"
             )
-        if fault is not None and self._is_period_right is None:
-            raise fault
-        self._is_period_right = fault is None
         if fault is not None:
+            if self._is_period_right is None:
+                raise fault
             self.source.fault = f"; {fault}"
+        self._is_period_right = fault is None
 
     def _split_rows(self, samples: np.ndarray) -> list[Rows]:
         """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
@@ -311,7 +311,7 @@ class Stream:
         latest = np.maximum.accumulate(np.concatenate([[-np.inf], self._last[0], stamps]))[-len(stamps) - 1 : -1]
         is_restart = latest - stamps > _RESTART_SECONDS
         if is_restart.any():
-            restart = int(np.argmax(is_restart))
+            restart = np.argmax(is_restart)
             rows = self._split_rows(samples[:, :restart])
             self._count(RESTARTS, 1)
             self._last, self._first_stamps = samples[:, :0], []
@@ -319,8 +319,6 @@ class Stream:
             return [*rows, *self._split_rows(samples[:, restart:])]
         is_later = stamps > latest
         self._count(DISORDERED, int(np.count_nonzero(~is_later)))
-        if not is_later.any():
-            return []
         # from the last sample, which was returned already, lost ones are interpolated
         samples, returned = np.concatenate([self._last, samples[:, is_later]], axis=1), self._last.shape[1]
         self._last = samples[:, -1:]
@@ -340,7 +338,7 @@ class Stream:
         """
         stamps, torque, *positions = samples
         steps = np.maximum(np.round(np.diff(stamps) / self._period), 1.0)
-        received = np.concatenate([[0.0], np.cumsum(steps)])
+        received = np.cumsum(np.append(0.0, steps))
         numbers = np.arange(received[-1] + 1.0)
         self._count(LOST, len(numbers) - len(received))
         if len(numbers) > len(received):
@@ -594,9 +592,9 @@ class Datagrams(Source):
 
     def _add_rows(self, rows: np.ndarray) -> None:
         columns = self._column_names()
-        if len(rows) and self._blocks and list(self._blocks[-1][0]) == list(columns):
-            rows = np.concatenate([self._blocks.pop()[1], rows])
         if len(rows):
+            if self._blocks and list(self._blocks[-1][0]) == list(columns):
+                rows = np.concatenate([self._blocks.pop()[1], rows])
             self._blocks.append((columns, rows))
 
     def _column_names(self) -> Sequence[ColumnName]:

@@ -76,11 +76,11 @@ def fit_lost_motion_by_direction(
     residuals = twist[is_clear] - terms @ coefficients
     residual = rms(residuals)
     # with a drift each stretch on one flank has a different level
-    stretch = np.concatenate([[0], np.cumsum(np.diff(signs) != 0)])
+    stretch = np.cumsum(np.append(0, np.diff(signs) != 0))
     levels = np.bincount(stretch, residuals) / np.bincount(stretch)
-    level_error = 2.0 * float(np.sqrt(np.mean(levels**2) / max(len(levels) - 2, 1)))
+    level_error = 2.0 * rms(levels) / math.sqrt(max(len(levels) - 2, 1))
     # corners of the motion are rounded by the filter: an error of 1e-4 at most
-    error = math.hypot(max(float(errors[0]), level_error), 1e-4 * value, other_error)
+    error = math.hypot(max(errors[0], level_error), 1e-4 * value, other_error)
     return LostMotion.from_motion(value, error, residual, changes, min(BLOCKS, len(levels)) - 1)
 
 
@@ -112,7 +112,7 @@ class _Cells:
 def _average_passes(
     times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float
 ) -> _Cells | None:
-    span = float(np.ptp(position))
+    span = np.ptp(position)
     moving = np.abs(velocity) > 0.25 * rms(velocity)
     if span == 0.0 or moving.sum() < MIN_SAMPLES:
         return None
@@ -122,7 +122,7 @@ def _average_passes(
     place, forwards, times = (BINS * share).astype(int), velocity[moving] > 0.0, times[moving]
     # a long rest may hide a change of the load
     rests = np.diff(times) > 0.02 * (times[-1] - times[0])
-    pass_number = np.concatenate([[0], np.cumsum((np.diff(forwards) != 0) | (np.diff(turns) != 0) | rests)])
+    pass_number = np.cumsum(np.append(0, (np.diff(forwards) != 0) | (np.diff(turns) != 0) | rests))
     _, first, inverse, count = np.unique(
         pass_number * BINS + place, return_index=True, return_inverse=True, return_counts=True
     )
@@ -151,10 +151,10 @@ def _shift_between_states(
     # usual constant of an MM-estimate (85 % of the efficiency of a mean)
     ordered, half = np.sort(shifts), len(shifts) // 2
     widths = ordered[half:] - ordered[: len(shifts) - half]
-    start = int(np.argmin(widths))
+    start = np.argmin(widths)
     location = float(ordered[start : start + half + 1].mean())
     # half of a normal distribution lies within 0.674 standard deviations
-    scale = float(widths[start]) / 1.349 + 1e-120
+    scale = widths[start] / 1.349 + 1e-120
     for _ in range(30):
         size = weights * np.clip(1.0 - ((shifts - location) / (3.44 * scale)) ** 2, 0.0, None) ** 2
         location = float(size @ shifts / size.sum())
@@ -186,7 +186,7 @@ def _find_states(cells: _Cells) -> np.ndarray | None:
                 break
             state = next_state
         shift, _ = _shift_between_states(cells, state)
-        size = float(np.sum(cells.subtract_group_means(cells.twist - shift * state) ** 2))
+        size = np.sum(cells.subtract_group_means(cells.twist - shift * state) ** 2)
         if math.isfinite(shift) and (best is None or size < best[0]):
             best = (size, state)
     return None if best is None else best[1]
@@ -196,18 +196,16 @@ def _find_best_levels(values: np.ndarray, shift: float, variance: float) -> np.n
     """Find the sequence of levels 0 and `shift` that fits best (Viterbi); each change costs 20 log-likelihoods."""
     change_cost = 40.0 * max(variance, 1e-12 * shift**2)
     cost = np.stack([values**2, (values - shift) ** 2], axis=1)
-    has_changed = np.zeros((len(values), 2), dtype=bool)
-    total = cost[0]
-    for i in range(1, len(values)):
+    total, changes = cost[0], []
+    for level_cost in cost[1:]:
         change = total[::-1] + change_cost
-        has_changed[i] = change < total
-        total = np.minimum(total, change) + cost[i]
-    state = np.zeros(len(values), dtype=bool)
-    level = int(np.argmin(total))
-    for i in range(len(values) - 1, -1, -1):
-        state[i] = bool(level)
-        level = 1 - level if has_changed[i][level] else level
-    return state
+        changes.append(change < total)
+        total = np.minimum(total, change) + level_cost
+    # backwards from the better end
+    levels = [np.argmin(total)]
+    for has_changed in reversed(changes):
+        levels.append(levels[-1] ^ has_changed[levels[-1]])
+    return np.array(levels[::-1], dtype=bool)
 
 
 def fit_lost_motion_by_load(
@@ -239,15 +237,13 @@ def fit_lost_motion_by_load(
     if size < 8.0 * error or len(changes) > passes:
         return None
     change_times = tuple(float(0.5 * (cells.time[i] + cells.time[i + 1])) for i in changes)
-    least, largest = np.quantile(math.copysign(1.0, value) * shifts, [0.1, 0.9])
+    least, largest = np.quantile(math.copysign(1.0, value) * shifts, [0.1, 0.9]).tolist()
     interval = student_interval(size, error, min(passes, BLOCKS) - 1)
-    return LostMotion(
-        size, error, interval, "load", len(change_times), change_times, (float(least), float(largest)), residual
-    )
+    return LostMotion(size, error, interval, "load", len(change_times), change_times, (least, largest), residual)
 
 
 def _explains_more_than_drift(cells: _Cells, residuals: np.ndarray) -> bool:
     """Return True if the residuals of two states are much smaller than those of a steady drift over time."""
     twist, time = cells.subtract_group_means(cells.twist), cells.subtract_group_means(cells.time)
-    slope = float(time @ twist) / max(float(time @ time), 1e-300)
-    return float(np.sum(residuals**2)) < 0.5 * float(np.sum((twist - slope * time) ** 2))
+    slope = time @ twist / max(time @ time, 1e-300)
+    return bool(np.sum(residuals**2) < 0.5 * np.sum((twist - slope * time) ** 2))

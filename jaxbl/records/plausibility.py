@@ -114,7 +114,7 @@ def _largest_windup(grid: Grid, shaft: NominalDrive) -> float:
     load = grid.values["theta_s"]
     velocity = (load[_SLOW_SAMPLES:] - load[:-_SLOW_SAMPLES]) / (_SLOW_SAMPLES * grid.period)
     # inertia and stiffness of a rough fit may both be off by half
-    return 3.0 * shaft.load_inertia * float(velocity.var() / load.var()) / (shaft.gear_ratio**2 * shaft.stiffness)
+    return 3.0 * shaft.load_inertia * velocity.var() / load.var() / (shaft.gear_ratio**2 * shaft.stiffness)
 
 
 def _check_ratio(file: LogFile, table: LogTable, gearing: Gearing, expected: float, windup: float) -> None:
@@ -159,8 +159,8 @@ def _check_motion_sizes(file: LogFile, table: LogTable, grid: Grid, expected: fl
 
     def relative_twist(ratio: float) -> float:
         """Return the rms twist over the rms motion: far below 1 if load and motor move together."""
-        moved = max(float(np.std(motor)), abs(ratio) * float(np.std(load)))
-        return float(np.std(motor - ratio * load)) / moved if moved else 0.0
+        moved = max(np.std(motor), abs(ratio) * np.std(load))
+        return float(np.std(motor - ratio * load) / moved) if moved else 0.0
 
     if relative_twist(expected) < 0.8:
         return
@@ -169,7 +169,7 @@ def _check_motion_sizes(file: LogFile, table: LogTable, grid: Grid, expected: fl
         (relative_twist(expected * factor), mistake) for factor, mistake in _likely_mistakes(table, expected) if factor > 0.0
     )
     if smallest_twist < 0.7:
-        relative_motion = float(np.std(motor)) / (abs(expected) * float(np.std(load)))
+        relative_motion = np.std(motor) / (abs(expected) * np.std(load))
         raise file.error(
             f"theta_e moves {relative_motion:.3g} times as far as gear_ratio {expected:g} times theta_s: {mistake}"
         )
@@ -207,7 +207,7 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     displacement, steps = sum(abs(move.sum()) for move in moves), np.concatenate(moves)
     torque = np.concatenate([grid.values["u"][segment][:-1] for segment in grid.segments])
     exchanged = np.abs(torque) @ np.abs(steps)
-    work_share = float(torque @ steps / exchanged) if exchanged else 0.0
+    work_share = torque @ steps / exchanged if exchanged else 0.0
     has_clear_inertia = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
     # 8 standard errors prove the wrong sign, 3 are enough for the right one
     inertia, error = rigid_fit.values[0], rigid_fit.errors[0]
@@ -268,7 +268,9 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
     if power_ratio >= _DOUBTFUL_FRICTION:
         power_ratio = max(viscous / nominal_viscous, 1.0) if shows_viscous else math.nan
     has_usual_friction = 1.0 / _DOUBTFUL_INERTIA < power_ratio < _DOUBTFUL_FRICTION
-    sure_factor = _SURE_FACTOR_FAST if _is_fast(rigid_fit, nominal) else _SURE_FACTOR
+    # faster than the antiresonance of the nominal drive; a rigid drive, or one without a load, has none
+    is_fast = nominal.load_inertia / nominal.gear_ratio**2 * rigid_fit.acceleration**2 > nominal.stiffness * rigid_fit.square
+    sure_factor = _SURE_FACTOR_FAST if is_fast else _SURE_FACTOR
     text, ratio, doubtful_ratio, sure_ratio = "", 1.0, math.inf, math.inf
     # a coefficient that noise, gravity, a gap or a spring hides says nothing
     if (
@@ -309,15 +311,6 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         )
     if is_doubtful and (is_surely_wrong or same_direction):
         file.contradiction = f"{text}: a unit of t, u or {channel} in [log] is wrong, or the model's number is"
-
-
-def _is_fast(rigid_fit: RigidFit, nominal: NominalDrive) -> bool:
-    """Return True if the motion is faster than the antiresonance of the nominal drive."""
-    load_inertia = nominal.load_inertia / nominal.gear_ratio**2
-    # a rigid drive, or one without a load, has no antiresonance
-    if not (load_inertia > 0.0 and rigid_fit.square > 0.0 and math.isfinite(nominal.stiffness)):
-        return False
-    return rigid_fit.acceleration**2 / rigid_fit.square > nominal.stiffness / load_inertia
 
 
 # remarks

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares import BLOCKS, column_rms, fit_residual, fit_with_jackknife, jackknife_variance, rms
+from .least_squares import BLOCKS, column_rms, fit_residual, fit_with_jackknife, jackknife_variance, mean_error, rms
 from .rigid_body import MIN_SPEED_SHARE, smooth_sign
 from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 
@@ -80,7 +80,7 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     if first_rows is None or rows is None:
         return None
     # the arc, however often it was gone over
-    turns = float(np.ptp(np.concatenate([first.motor[segment] for segment in first.segments]))) / (2.0 * np.pi)
+    turns = np.ptp(np.concatenate([first.motor[segment] for segment in first.segments])) / (2.0 * np.pi)
     if turns * _MAX_HARMONIC < _MIN_PERIODS:
         return None
     lowest = int(np.ceil(_MIN_PERIODS / turns))
@@ -121,7 +121,7 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     block_squares = np.array([np.sum(part**2, axis=0) for part in np.array_split(residuals, BLOCKS)])
     squares_without_waves, squares = block_squares[:, 0], block_squares[:, 1:]
     total = squares.sum(axis=0)
-    best = int(np.argmin(total))
+    best = np.argmin(total)
     if not _error_reduction(squares_without_waves, squares[:, best]) > _SURE_SHIFT_ERRORS:
         return None
     lowest = np.flatnonzero((total <= np.roll(total, 1)) & (total <= np.roll(total, -1)))
@@ -213,4 +213,4 @@ def _error_reduction(squares: np.ndarray, reduced: np.ndarray) -> float:
     """Return by how many standard errors squares fall from `squares` to `reduced`, which are sums over blocks."""
     gains = squares - reduced
     # a difference by rounding is none
-    return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(len(gains)), 1e-6 * np.mean(squares), 1e-300))
+    return float(np.mean(gains) / max(mean_error(gains), 1e-6 * np.mean(squares), 1e-300))

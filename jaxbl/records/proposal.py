@@ -126,10 +126,12 @@ def guess_log_table(path: str | Path) -> tuple[_Table, list[str]]:
         name, unit = _split_unit(file, column)
         kinds = _find_kinds(name)
         channel = _guess_channel(name, unit, kinds)
+        if not channel:
+            continue
         # a commanded torque stands for one that was not measured, a side alone for a position
         is_second_choice = bool(kinds & {"setpoint", "load", "supply"}) if channel == "u" else "position" not in kinds
-        values = file.load_values(column) if channel else np.zeros(0)
-        if channel == "t" or (values.dtype.kind in "iuf" and channel and (channel == "u" or "setpoint" not in kinds)):
+        values = file.load_values(column)
+        if channel == "t" or (values.dtype.kind in "iuf" and (channel == "u" or "setpoint" not in kinds)):
             candidates.setdefault(channel, []).append(_Candidate(is_second_choice, column, name, unit, values))
     guesses: list[str] = []
     table: _Table = {}
@@ -234,7 +236,7 @@ def _make_table(channel: str, candidate: _Candidate, guesses: list[str]) -> _Tab
 def _guess_time_unit(unit: str, values: np.ndarray, guesses: list[str]) -> str:
     if unit in SECONDS_PER_UNIT:
         return unit
-    median = float(np.median(np.diff(values.astype(float)))) if len(values) > 1 else 0.0
+    median = np.median(np.diff(values.astype(float))) if len(values) > 1 else 0.0
     # drives are sampled every 10 us to 0.1 s
     unit = next((name for name, seconds in SECONDS_PER_UNIT.items() if median * seconds <= 0.1), "s")
     if unit != "s":
@@ -321,7 +323,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
         guesses.append("The log does not show an inertia: 1 is a placeholder.")
     else:
         inertia, viscous = dynamics.values[:2].tolist()
-        if inertia < 2.0 * float(dynamics.errors[0]) or inertia <= 0.0:
+        if inertia < 2.0 * dynamics.errors[0] or inertia <= 0.0:
             # then the inertia takes a small part of the torque
             inertia = 0.1 * dynamics.torque / dynamics.acceleration
             guesses.append(f"The log hardly shows the inertia: {inertia:.2g} would take a tenth of the torque.")
@@ -349,7 +351,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     # half of the torque winds the shaft up
     slope, slope_error, _ = fit_twist(record, compute_velocity(record), ratio)
     twist = np.std(compute_twist(record, ratio)) - 0.5 * gearing.lost_motion
-    least = 0.5 * float(np.std(record.torque)) / max(float(twist), 0.1 * gearing.lost_motion, 1e-300)
+    least = 0.5 * np.std(record.torque) / max(twist, 0.1 * gearing.lost_motion, 1e-300)
     # False for nan, too
     stiffness = max(0.5 / max(slope, 2.0 * slope_error, 1e-300), least if least < 1e12 else 0.0)
     return replace(drive, stiffness=stiffness, half_gap=0.5 * max(gearing.lost_motion, 0.0))

@@ -264,7 +264,7 @@ def _resample_and_align(
             channels = {**channels, "u": channels["u"]._replace(hold=hold)}
             delays["u"] = Delay(skew)
             file.corrections |= {"u.skew": skew, "u.sampled": float(hold == "sampled")}
-            late = skew + (0.5 * segmented.period if hold == "sampled" else 0.0)
+            late = skew if hold == "zoh" else lateness.value
             lateness = lateness._replace(value=lateness.value - late)
             grid, gearing = resample()
     is_estimated = any(raw.skew == "estimate" for raw in channels.values())
@@ -317,8 +317,8 @@ def _find_torque_keys(
 ) -> tuple[Literal["zoh", "sampled"], float] | None:
     """Return hold and skew (s) of u that undo its lateness, and say so; None if it stays, which is said, too."""
     is_left_out = table.hold is None and (table.u is None or table.u.skew is None)
-    size, half_periods = abs(lateness.value), lateness.half_periods
-    if not (lateness.is_known and is_left_out and size > 3.0 * lateness.error) or half_periods == 0:
+    half_periods = lateness.half_periods
+    if not (lateness.is_known and is_left_out and abs(lateness.value) > 3.0 * lateness.error) or half_periods == 0:
         return None
     text = f"u is {_describe_delay(lateness.value, lateness.error)} than the motion that it causes"
     if half_periods is None:
@@ -427,7 +427,7 @@ def _measure_channel(
     """Measure a channel, with remarks; noise and bandwidth are those of the longest segment of `source`."""
     segment = longest_segment(source.segments)
     values, times = source.values[name][segment], source.time[segment]
-    period = float(times[-1] - times[0]) / (len(values) - 1)
+    period = (times[-1] - times[0]) / (len(values) - 1)
     readings = np.concatenate([raw.values[rows] for rows in segmented.segments])
     step = find_resolution(readings)
     is_position = name.startswith("theta")
@@ -442,11 +442,11 @@ def _measure_channel(
         largest=float(readings.max()),
         resolution=step,
         noise=float(np.sqrt(noise_floor(*power_spectrum(values, period)) * 0.5 / period)),
-        bandwidth=find_bandwidth(values, period, differentiate=is_position) if np.ptp(values) else 0.0,
+        bandwidth=find_bandwidth(values, period, differentiate=is_position),
         saturated=saturated,
         jumps=jumps,
     )
-    note_channel_faults(file, name, statistics, float(np.quantile(np.abs(np.diff(values)), 0.99)) / period)
+    note_channel_faults(file, name, statistics, np.quantile(np.abs(np.diff(values)), 0.99) / period)
     return statistics
 
 
@@ -471,7 +471,7 @@ def join_records(records: Sequence[Record]) -> Record:
     period, end = first.sample_period, 0.0
     times, segments, logs = [], [], []
     for record in records:
-        if not np.isclose(record.sample_period, period, rtol=1e-6, atol=0.0):
+        if not math.isclose(record.sample_period, period, rel_tol=1e-6):
             raise InputError(
                 f"{record.path}: is sampled every {record.sample_period:.6g} s, {first.path} every {period:.6g} s; "
                 f"set [log] resample = {period:.6g} to read both at the same period"
@@ -480,7 +480,7 @@ def join_records(records: Sequence[Record]) -> Record:
         _require_channels(first, _list_channels(record), record)
         count = sum(map(len, times))
         times.append(record.time - record.time[0] + end)
-        end = float(times[-1][-1]) + _PAUSE_PERIODS * period
+        end = times[-1][-1] + _PAUSE_PERIODS * period
         segments += [slice(segment.start + count, segment.stop + count) for segment in record.segments]
         logs += [(path, slice(rows.start + count, rows.stop + count)) for path, rows in record.logs]
     names = ", ".join(record.path.name for record in records)

@@ -104,11 +104,11 @@ def _common_times(
 ) -> np.ndarray:
     """Return evenly spaced times at which all channels have values, s; on the grid from `first`, unless it is None."""
     begins, ends = np.transpose([stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays])
-    begin, end = float(begins.max()), float(ends.min())
+    begin, end = begins.max(), ends.min()
     if first is not None:
         # the samples of channels without skew lie on this grid
         begin = first + period * math.ceil((begin - first) / period - 1e-6)
-    count = max(math.floor((end - begin) / period + 1e-6) + 1, 0)
+    count = math.floor((end - begin) / period + 1e-6) + 1
     if count > _MAX_OVERSAMPLING * len(stamps) + MIN_SAMPLES:
         raise file.error(
             f"a period of {period:g} s makes {count} samples of {len(stamps)}; at least a hundredth of the log's is needed"
@@ -130,7 +130,7 @@ def _hold_over_periods(
     """
     edges, bounds = np.append(stamps, max(stamps[-1], grid[-1]) + 2.0 * period), np.append(grid, grid[-1] + period)
     if hold == "zoh":
-        integral = np.concatenate([[0.0], np.cumsum(values * np.diff(edges))])
+        integral = np.cumsum(np.append(0.0, values * np.diff(edges)))
         return np.diff(np.interp(bounds, edges, integral)) / period
     from scipy.interpolate import CubicSpline
 

@@ -64,8 +64,13 @@ def smooth_sign(velocity: np.ndarray) -> np.ndarray:
     return velocity / np.hypot(velocity, 0.02 * rms(velocity) + 1e-300)
 
 
-def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float) -> RigidFit | None:
-    """Regress a torque, held from each stamp to the next, on the motion of an encoder; None if that is too small."""
+def fit_rigid_drive(
+    torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float, beside: np.ndarray | None = None
+) -> RigidFit | None:
+    """Regress a torque, held from each stamp to the next, on the motion of an encoder; None if that is too small.
+
+    `beside` is the position of another side that the same torque moves: its inertia and friction then take part.
+    """
     bandwidth = find_motion_bandwidth(position, segments, period)
     if bandwidth == 0.0 or np.ptp(torque) == 0.0:
         return None
@@ -79,6 +84,9 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
         # the slope of the torque takes a lateness of it
         slope = np.gradient(smooth_torque, period)
         columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), slope, smooth_torque]
+        if beside is not None:
+            _, velocity, acceleration = low_pass_motion(beside[segment], cutoff, period)
+            columns[6:6] = acceleration, velocity, low_pass(smooth_sign(velocity), cutoff, period)
         parts.append(np.stack(columns, axis=1)[trim_filter_ends(len(smooth), cutoff, period)])
     if not parts:
         return None
@@ -87,15 +95,16 @@ def fit_rigid_drive(torque: np.ndarray, position: np.ndarray, segments: Sequence
     # what holds a drive at rest is no function of its motion
     moving = signals[np.abs(velocity) > MIN_SPEED_SHARE * rms(velocity)]
     rows, moving_target, terms = moving[:, :-1], moving[:, -1], moving[:, :5]
+    varying = np.delete(rows, (4, 5), axis=1)
     if not len(moving) or np.ptp(moving_target) == 0.0:
         return None
     coefficients, errors = fit_with_jackknife(moving_target, rows)
     if not np.isfinite(coefficients).all():
         # two terms are proportional to each other
-        coefficients, errors = np.zeros(6), np.full(6, np.inf)
+        coefficients, errors = np.zeros(rows.shape[1]), np.full(rows.shape[1], np.inf)
     inflation = np.full(5, np.inf)
-    if np.isfinite(errors).all() and np.ptp(terms[:, :4], axis=0).all():
-        inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(terms[:, :4].T))), 1.0)
+    if np.isfinite(errors).all() and np.ptp(varying, axis=0).all():
+        inflation = np.append(np.diag(np.linalg.inv(np.corrcoef(varying.T)))[:4], 1.0)
     return RigidFit(
         values=coefficients[:5],
         errors=errors[:5],

@@ -46,13 +46,13 @@ class ChannelStatistics:
 
 def find_resolution(values: np.ndarray) -> float:
     """Return the step of which all differences between values are multiples; 0 if there is none."""
-    span = float(np.ptp(values)) if len(values) else 0.0
+    span = np.ptp(values) if len(values) else 0.0
     steps = np.diff(np.unique(values))
     # rounding errors of floating-point arithmetic are not steps
-    steps = steps[steps > max(1e-9 * span, 1e-13 * float(np.abs(values).max(initial=0.0)))]
+    steps = steps[steps > max(1e-9 * span, 1e-13 * np.abs(values).max(initial=0.0))]
     if len(steps) == 0 or len(steps) > 0.98 * (len(values) - 1):
         return 0.0
-    step = float(np.quantile(steps, 0.02)) if len(steps) > 200 else float(steps.min())
+    step = np.quantile(steps, 0.02) if len(steps) > 200 else steps.min()
     # the smallest steps first, so that the rounding of large ones is not taken for a remainder
     for limit in (1.5, 10.5, 100.5):
         small_steps = steps[steps < limit * step]
@@ -125,8 +125,6 @@ def find_runs(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def saturated_share(values: np.ndarray, step: float) -> float:
     """Return the share of samples in runs of five or more at the least or largest value (within half a `step`)."""
-    if np.ptp(values) == 0.0:
-        return 0.0
     saturated = 0
     for extreme in (values.min(), values.max()):
         starts, stops = find_runs(np.abs(values - extreme) <= 0.5 * step)
@@ -151,9 +149,9 @@ def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = 
     deviation = np.abs(differences - median_filter(differences, 7, mode="nearest"))
     # spread of the motion nearby; the quantiles leave out an outlier or two
     high, low = (percentile_filter(differences, percent, 31, mode="nearest") for percent in (90, 10))
-    typical = 1.4826 * float(np.median(deviation))
+    typical = 1.4826 * np.median(deviation)
     outliers = np.flatnonzero(
-        deviation > np.maximum(2.0 * (high - low), max(12.0 * typical, 4.5 * step, 1e-9 * float(np.ptp(positions))))
+        deviation > np.maximum(2.0 * (high - low), max(12.0 * typical, 4.5 * step, 1e-9 * np.ptp(positions)))
     )
     # an outlier spoils two differences
     return int(np.count_nonzero(np.diff(outliers, prepend=-10) > 2))

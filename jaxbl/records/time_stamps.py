@@ -110,7 +110,7 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     intervals = np.diff(stamps[is_full])
     median = float(np.median(intervals)) or float(np.mean(intervals))
     # stamps that were rounded to more than a period come in groups
-    group_interval = 0.0 if np.median(intervals) else float(np.median(intervals[intervals > 0.0]))
+    group_interval = 0.0 if np.median(intervals) else np.median(intervals[intervals > 0.0])
     if not _SHORTEST_PERIOD <= median <= _LONGEST_PERIOD:
         raise file.error(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
     if median >= _DOUBTFUL_PERIOD:
@@ -139,8 +139,7 @@ def join_files(file: LogFile, table: LogTable) -> None:
         other_stamps = _read_stamps(other, table)
         if (file.date is None) != (other.date is None):
             raise other.error(f"has {'numbers' if file.date else 'dates'} as stamps, and {file.path} has not")
-        if file.date is not None and other.date is not None:
-            other_stamps = other_stamps + 1e-9 * (other.date - file.date)
+        other_stamps = other_stamps + 1e-9 * ((other.date or 0) - (file.date or 0))
         if max(stamps[0], other_stamps[0]) >= min(stamps[-1], other_stamps[-1]):
             raise other.error(
                 f"its times, {other_stamps[0]:g} to {other_stamps[-1]:g} s, and those of {file.path}, {stamps[0]:g} to "
@@ -182,7 +181,7 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
     if goes_back.any() or stamps[0] == stamps[-1]:
         fault = f" is {stamps[0]:g} s in all rows"
         if goes_back.any():
-            row = int(np.argmax(goes_back)) + 1
+            row = np.argmax(goes_back) + 1
             fault = f", data row {row + 1}: time goes back from {stamps[row - 1]:.16g} s to {stamps[row]:.16g} s"
         raise file.error(f"column {file.find_column(time_table.column_or('t'))!r}{fault}; stamps should increase")
     return stamps
@@ -207,8 +206,9 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray, is_full: np
     """Return the numbers of the rows that `where`, `start` and `stop` select; `stamps` are s from the first one."""
     is_selected = is_full.copy()
     for column, required in (table.where or {}).items():
-        file.check_length(file.find_column(column), len(stamps))
-        column_values = file.load_values(file.find_column(column))
+        name = file.find_column(column)
+        file.check_length(name, len(stamps))
+        column_values = file.load_values(name)
         is_selected &= column_values == required
         if not is_selected.any():
             examples = ", ".join(map(repr, np.unique(column_values.astype(object))[:6].tolist()))
@@ -246,7 +246,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     distinct = (np.diff(times, prepend=-1.0) != 0.0) | is_even
     repeated = len(times) - int(distinct.sum())
     if repeated:
-        row = rows[int(np.argmin(distinct))] + 1
+        row = rows[np.argmin(distinct)] + 1
         file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
     times, rows = times[distinct], rows[distinct]
     pieces, segments = _split_at_intervals(times, stamps.max_interval)
@@ -258,7 +258,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
         )
     intervals = np.diff(times)
     if len(pieces) > 1:
-        longest_gap = int(np.argmax(intervals))
+        longest_gap = np.argmax(intervals)
         left_out = len(times) - samples
         file.notes.append(
             f"Gaps: {len(pieces) - 1}; segments: {len(segments)}; the longest gap is {intervals[longest_gap]:.4g} s, "
@@ -270,7 +270,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     lost = within * (np.round(intervals / period) - 1.0)
     off = within * (intervals - (lost + 1.0) * period)
     if not is_even and 0.0 < lost.mean() < _MOST_LOST and abs(off).max() < 0.1 * period:
-        first = int(np.argmax(lost > 0.0))
+        first = np.argmax(lost > 0.0)
         file.notes.append(
             f"{lost.sum():.0f} rows are missing, after data row {rows[first] + 1} first; they are interpolated."
         )
@@ -310,7 +310,7 @@ def fit_even_stamps(stamps: np.ndarray) -> StampFit:
     index = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
     middle = stamps.mean()
     period = float(index @ (stamps - middle) / (index @ index))
-    deviation = float(np.abs(stamps - middle - period * index).max())
+    deviation = np.abs(stamps - middle - period * index).max()
     # 2 % of a period changes no result; stamps that were rounded, say to milliseconds, are off by up to half a step
     intervals = np.diff(stamps)
     rounding = find_resolution(intervals)

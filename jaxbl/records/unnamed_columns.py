@@ -46,7 +46,7 @@ def find_latest(signals: _Signals) -> ColumnName:
     latest, *later = signals
     for column in later:
         before, after = (signals[name] - np.mean(signals[name]) for name in (latest, column))
-        size = float(np.linalg.norm(before) * np.linalg.norm(after)) or np.inf
+        size = np.linalg.norm(before) * np.linalg.norm(after) or np.inf
         is_same = abs(np.std(after) - np.std(before)) < _SAME_SIZE * np.std(before)
         if is_same and correlate(before, after).max() > _SAME * size and before @ np.gradient(after) > _LATE * size:
             latest = column
@@ -65,12 +65,11 @@ def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> t
     """
     if len({len(values) for values in signals.values()}) != 1:
         return {}, None
-    is_timed = times is not None and times.dtype.kind in "iuf"
-    period = float(np.median(np.diff(times))) if times is not None and is_timed else 1.0
+    period = float(np.median(np.diff(times))) if times is not None and times.dtype.kind in "iuf" else 1.0
     names = [*signals]
     moves = np.stack([signals[name] - np.mean(signals[name]) for name in names])
     size = np.std(moves, axis=1)
-    first = int(np.argmin(np.std(np.diff(moves), axis=1) / size))
+    first = np.argmin(np.std(np.diff(moves), axis=1) / size)
     likeness = moves @ moves[first] / (moves.shape[1] * size * size[first])
     is_same = (likeness > _SAME) & (np.abs(size / size[first] - 1.0) < _SAME_SIZE)
     position = find_latest({names[i]: signals[names[i]] for i in np.flatnonzero(is_same)})
@@ -88,7 +87,7 @@ def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> t
         if fit.shares[1] < _SPEED:
             torques[fit.residual] = names[i]
         elif times is None:
-            ratio = 1.0 / abs(float(fit.values[1]))
+            ratio = 1.0 / abs(fit.values[1])
             decade = 10.0 ** np.floor(np.log10(ratio))
             found_period = next((decade * digits for digits in _ROUND if abs(ratio / decade / digits - 1.0) < 0.01), None)
     if torques:

@@ -100,7 +100,7 @@ def _noise(comparison: Comparison) -> str:
         )
     how = f"differences seed by seed, {seeds} seeds" if comparison.paired else "means over seeds, none of them in common"
     few = " So few seeds show only what is far beyond it." if comparison.paired and seeds < 4 else ""
-    return f"Noise: by {how}. Of the points said to differ at most {100 * FALSE_DISCOVERY_RATE:g} % on average do not.{few}"
+    return f"Noise: by {how}. At most {100 * FALSE_DISCOVERY_RATE:g} % of the points said to differ do so by chance.{few}"
 
 
 def _ways(change: MetricChange) -> str:

@@ -57,8 +57,6 @@ def draw(result: StudyResult) -> list[Figure]:
     config, points, figures = result.config, Points(result.config), []
     specs = config.figures or default_figures(config, result.columns)
     check_figures(config, specs, result.columns)
-    runs = sum(map(len, result.batches(["seed"]))) if specs else 0
-    unfinished = "" if result.is_finished(runs) else f" The study is not finished: {runs} runs so far, white where none is."
     for i, spec in enumerate(specs):
         rows = _rows(result, spec, points)
         if spec.theory is not None:
@@ -67,7 +65,7 @@ def draw(result: StudyResult) -> list[Figure]:
             panels, caption = _heatmap(config, rows, spec, points)
         else:
             panels, caption = _lines(config, rows, spec)
-        caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}{unfinished}"
+        caption = f"{value_label(spec.value)} over {path_words(config, spec.x)}{caption}"
         name = re.sub(r"[^A-Za-z0-9]+", "_", f"{spec.kind}_{spec.value}").strip("_")
         same = sum(earlier.name.partition("-")[0] == name for earlier in figures)
         columns = arrange(len(panels))

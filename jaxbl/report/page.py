@@ -38,6 +38,8 @@ _SHORT = 8
 """Rows of a table that may stand above the figures."""
 _WIDE = 700
 """Pixels beyond which a figure has the whole width of the page; others stand in two columns."""
+_FLAT = 0.4
+"""Height over width below which a wide figure stands below the card's text, and is still seen at once, else beside it."""
 _PARTS = "vendored/uPlot.css", "page.css", "vendored/uPlot.js", "shared.js", "chart.js", "page.js"
 
 
@@ -71,10 +73,11 @@ def _card(result: Result, figure: str) -> str:
     """The head of the page: verdict, answer, key figures, the commands to go on with, and the first figure."""
     verdict = f'<p class="verdict {result.verdict.split()[0]}">{VERDICTS[result.verdict]} {result.verdict.capitalize()}</p>'
     keys = "".join(f"<div><b>{escape(value)}</b> {escape(meaning)}</div>" for value, meaning in result.key_figures)
-    steps = "".join(
-        f"<dt>{'Or' if i else 'Next'}: {escape(step.answers)}</dt><dd><pre>{escape(step.command)}</pre></dd>"
-        for i, step in enumerate(result.next_steps)
-    )
+    steps = ""
+    for i, step in enumerate(result.next_steps):
+        # an option goes on in a new line as a whole
+        words = " ".join(f"<span>{escape(word)}</span>" for word in step.command.split(" "))
+        steps += f"<dt>{'Or' if i else 'Next'}: {escape(step.answers)}</dt><dd><pre>{words}</pre></dd>"
     texts = [verdict, f'<p class="answer">{escape(result.headline)}</p>', f'<div class="keys">{keys}</div>' if keys else ""]
     return f'<section class="card"><div>{"".join(texts)}{f"<dl>{steps}</dl>" if steps else ""}</div>{figure}</section>'
 
@@ -93,7 +96,7 @@ def _figure(name: str, picture: Picture) -> str:
     panels = json.dumps(picture.panels, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
     image = f'<img src="{picture.source}" alt="{escape(picture.described)}" width="{width}" height="{height}">'
     label = "figure: arrow keys read values, plus and minus zoom, 0 shows the whole"
-    wide = ' class="wide"' if width > _WIDE else ""
+    wide = f' class="wide{" flat" if height < _FLAT * width else ""}"' if width > _WIDE else ""
     return (
         f'<figure{wide} data-name="{escape(name)}"><div class="view" tabindex="0" role="group" aria-label="{label}" '
         f'style="width:{width}px">{image}</div><figcaption>{escape(picture.caption)}</figcaption>'

@@ -49,7 +49,9 @@ def answer_sweep(result: StudyResult) -> Result:
     config, survey, remarks = result.config, _Survey(result), []
     finished, figures = result.is_finished(survey.runs), []
     if not finished:
-        remarks.append(f"The study is not finished: it has {result.runs} runs so far. Go on with 'jaxbl sweep'.")
+        remarks.append(
+            f"The study is not finished: {survey.runs} runs so far, white where none is. Go on with 'jaxbl sweep'."
+        )
     if survey.diverged:
         remarks.append(f"{survey.diverged} runs diverged: finite = false in the table, grey in the figures.")
     for side, (best, runs) in survey.best.items():
@@ -64,8 +66,10 @@ def answer_sweep(result: StudyResult) -> Result:
         place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
         as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
         figures += [
-            KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: velocity error of the best gains, rms ({place})"),
-            KeyFigure(f"× {best.margin:.3g}", f"{side}: change of these gains to fail or err twice as much; {as_good}"),
+            KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: worst velocity error, rms, of the best gains ({place})"),
+            KeyFigure(
+                f"× {best.margin:.3g}", f"{side}: from these to the nearest that fail or err twice as much; {as_good}"
+            ),
         ]
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)

@@ -33,7 +33,7 @@ def error_label(summary: JsonObject) -> str:
 
 def _map(tuning: Tuning, side: str) -> Figure:
     summary, bound = tuning.summary, tuning.summary["f_plus"][side]
-    gains, limits, label = summary["gains"][side], summary["limits"][side], f"worst {error_label(summary)}"
+    gains, label = summary["gains"][side], f"worst {error_label(summary)}"
     # the coarse map
     runs = tuning.candidates[side].query("stage == 0").pivot(index="lambda", columns="alpha")
     error = runs["error"]
@@ -51,15 +51,17 @@ def _map(tuning: Tuning, side: str) -> Figure:
     # on the study's own excitation
     compared = [row for row in summary["named"] if row["side"] == side and row["name"] != "tuned"]
     for row, marker in zip(compared, cycle(MARKERS), strict=False):
-        parts += [mark(row["alpha"], row["lambda"], literal(row["name"]), marker, 8.0)]
+        # a mark outside stands on the edge
+        inside = alphas[0] <= row["alpha"] <= alphas[1] and lambdas[0] <= row["lambda"] <= lambdas[1]
+        name = literal(row["name"]) + " (off the map)" * (not inside)
+        parts += [mark(row["alpha"], row["lambda"], name, marker, 8.0)]
     parts += [mark(gains["alpha"], gains["lambda"], "tuned")]
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     if flat := flat_remark(values):
         title = f"{title}\n{flat}"
-    remark = f" What forbids a smaller error: {' and '.join(limits['binding'])}." if limits["binding"] else ""
     caption = (
         f"{side}: {label} over all runs, on the coarse map; above and on the right the axes of the atlas "
-        f"(jaxbl verify).{remark} Curves: the exact gain condition at the f⁺ of the pilot run, dotted with the margins "
+        f"(jaxbl verify). Curves: the exact gain condition at the f⁺ of the pilot run, dotted with the margins "
         "asked for; the usual rule's gains for this f⁺ and larger ones. The other gains are compared below."
     )
     panel = Panel(*gain_axes(bound, alphas, lambdas), parts, title)
@@ -68,9 +70,7 @@ def _map(tuning: Tuning, side: str) -> Figure:
 
 def _missing(names: list[str]) -> str:
     """Say what gains do that miss constraints."""
-    margins = " and ".join(name for name in names if name != "converged")
-    parts = margins and f"misses {margins}", "does not converge" * ("converged" in names)
-    return " and ".join(filter(None, parts))
+    return " and ".join("does not converge" if name == "converged" else f"misses {name}" for name in names)
 
 
 _GAINS = ("lambda", "λ", "√rad/s"), ("alpha", "α", "rad/s²")
@@ -157,14 +157,16 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
     for side, verdict in summary["verdict"].items():
         worst, factors = summary["achieved"][side][metric], summary["holdout"]["factors"][side]
         texts = (
-            f" (× {factor[metric]['worst']:.3g} with {describe_gains(name)})"
+            f" ({factor[metric]['worst']:.3g} times this with {describe_gains(name)})"
             for name, factor in factors.items()
             if "why_none" not in factor and factor[metric]["worst"] is not None
         )
         meaning = f"{side}: worst {summary['objective']} error, rms{next(texts, '')}"
         figures += [
             KeyFigure(f"{worst:.3g} {SIDE_METRICS[metric].unit}", meaning),
-            KeyFigure(f"× {verdict['margin']:.3g}", f"{side}: change of the gains until they fail or err twice as much"),
+            KeyFigure(
+                f"× {verdict['margin']:.3g}", f"{side}: from these gains to the nearest that fail or err twice as much"
+            ),
         ]
     return figures
 

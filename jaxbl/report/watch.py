@@ -53,8 +53,8 @@ def describe(watch: Watch) -> Result:
             f"the window of {summary['window']:g} s."
         )
     elif limit is not None:
-        gap = f"{last['half_gap']:.4g} (95 %: at most {last['half_gap_to']:.4g})"
-        headline = f"No alarm: the half gap is {gap}, and the limit {limit:g} {units['half_gap']}."
+        gap = f"{last['half_gap']:.4g} {units['half_gap']} (95 %: at most {last['half_gap_to']:.4g})"
+        headline = f"No alarm: the half gap, {gap}, is below the limit of {limit:g} {units['half_gap']}."
     figures = [
         KeyFigure(
             f"{end[name]:.4g} {units[name]}",
@@ -97,7 +97,7 @@ def draw(watch: Watch) -> list[Figure]:
     if not len(watch.values):
         return []
     task = watch.task
-    caption = f"Numbers of the last {task.window:g} s by both observers, with 95 % intervals."
+    caption = f"Numbers of the {task.window:g} s before each time by both observers, with 95 % intervals."
     if task.alarm_gap is not None:
         caption += " The alarm is on where the gap is beyond the limit with a probability of 99.9 %."
     # gap and stiffness are seen at once; friction, below, acts on a shaft of its own on each side

@@ -109,8 +109,11 @@ def test_page_of_a_sweep(tmp_path):
         "40 runs: the motor observer converges in 80.0 %, with the best gains in every run.",
     )
     assert found.key_figures == [
-        ("2.66 rad/s", "motor: velocity error of the best gains, rms (alpha = 2.66, lambda = 2.71)"),
-        ("× 2.66", "motor: change of these gains to fail or err twice as much; 4 of 20 gains are as good within 5 %"),
+        ("2.66 rad/s", "motor: worst velocity error, rms, of the best gains (alpha = 2.66, lambda = 2.71)"),
+        (
+            "× 2.66",
+            "motor: from these to the nearest that fail or err twice as much; 4 of 20 gains are as good within 5 %",
+        ),
     ]
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == len(list((tmp_path / "figures").iterdir())) == 1
