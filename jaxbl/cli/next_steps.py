@@ -40,20 +40,16 @@ def after_demo(card: "Result", study: "Config", folder: Path) -> list[NextStep]:
 def after_sweep(card: "Result", study: "Config", folder: Path) -> list[NextStep]:
     """Propose commands for a sweep's folder, and for the study in it."""
     file = folder / "study.toml"
-    steps = [_propose("How do other metrics look, over other axes? Maps in the browser.", "explore", folder)]
+    explore = _propose("How do other metrics look, over other axes? Maps in the browser.", "explore", folder)
     if is_remote(file):
-        return steps
+        return [explore]
+    run = _propose("What happens over time, with the study's own numbers?", "simulate", file, "--out", f"{folder}_run")
     gains = {f"observer.{side}.{gain}" for side in study.sides for gain in ("lambda", "alpha")}
     # where no gains work, none can be chosen
     if gains & {*study.axis_paths} and card.verdict != "failed":
         question = "Which gains have the least error, and are they better than the usual rule?"
-        steps.insert(0, _propose(question, "tune", file, "--out", f"{folder}_gains"))
-    steps += [
-        _propose(
-            "What happens over time? One run, with the study's own numbers.", "simulate", file, "--out", f"{folder}_run"
-        )
-    ]
-    return steps
+        return [_propose(question, "tune", file, "--out", f"{folder}_gains"), explore, run]
+    return [explore, run]
 
 
 def after_run(card: "Result", config: Path) -> list[NextStep]:
@@ -82,8 +78,9 @@ def after_inspection(log: Path, model: Path | None) -> list[NextStep]:
 
 def after_comparison(card: "Result", folder: Path) -> list[NextStep]:
     """Propose to look at the points of both studies, if they have some."""
-    step = _propose("How do both look, point by point? Maps in the browser.", "explore", folder)
-    return [step] * (card.verdict != "no answer")
+    return [_propose("How do both look, point by point? Maps in the browser.", "explore", folder)] * (
+        card.verdict != "no answer"
+    )
 
 
 def after_proposal(log: Path, model: Path) -> list[NextStep]:

@@ -116,6 +116,8 @@ def is_finer_law(name: str) -> bool:
     return any(words.intersection(kind.split("_")) for kind in EFFECTS[name].special_cases)
 
 
+_make_effect = lru_cache(maxsize=4096)(make_effect)
+"""Screening after screening asks for the same ones."""
 _AT_ONCE = 6
 """Effects of one name whose torques one compiled program computes."""
 _STEP = 0.02
@@ -151,7 +153,7 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
             continue
         # of one that remembers its input the first samples are the clearest mark on many a log; not where all that it
         # remembers is known
-        remembers = remembers_input(_effect(name, fixed)) and not EFFECTS[name].state_from_input
+        remembers = remembers_input(_make_effect(name, **fixed)) and not EFFECTS[name].state_from_input
         for from_rest in (False, True) if remembers else (False,):
             yield _trial(name, fixed, from_rest)
 
@@ -166,7 +168,7 @@ def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:
         (size,) = {float(next(iter(roles[leaf].trials(log)))) for leaf in direction}
         numbers = dict.fromkeys(cls.sizes(), 0.0) | {leaf: size * share for leaf, share in direction.items()} | fixed
         turns = [{}] if phase is None else [{phase: 0.0}, {phase: 0.5 * math.pi}]
-        effects += [_effect(name, numbers | turn) for turn in turns]
+        effects += [_make_effect(name, **numbers, **turn) for turn in turns]
         sizes += [size] * len(turns)
 
     def columns(_: MotionTorques, torques: Sequence[Torques]) -> Torques:
@@ -191,7 +193,7 @@ def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:
 def _trial(name: str, fixed: Numbers, from_rest: bool) -> Candidate:
     """An effect without sizes: the first of its numbers about the value tried."""
     leaf, value = next(iter(fixed.items()))
-    effects = tuple(_effect(name, fixed | {leaf: value * math.exp(step)}) for step in (-_STEP, 0.0, _STEP))
+    effects = tuple(_make_effect(name, **(fixed | {leaf: value * math.exp(step)})) for step in (-_STEP, 0.0, _STEP))
 
     def columns(_: MotionTorques, torques: Sequence[Torques]) -> Torques:
         below, middle, above = torques
@@ -202,14 +204,6 @@ def _trial(name: str, fixed: Numbers, from_rest: bool) -> Candidate:
         return fixed | {leaf: value * math.exp(change)} if abs(change) < REACH else None
 
     return Candidate(name, 1, effects, columns, numbers_of, offset=True, from_rest=from_rest)
-
-
-def _effect(name: str, numbers: Numbers) -> AbstractEffect:
-    return _make_cached(name, **numbers)
-
-
-_make_cached = lru_cache(maxsize=4096)(make_effect)
-"""Screening after screening asks for the same ones."""
 
 
 class Forces:

@@ -319,7 +319,7 @@ def _judge_lost_motion(record: Record, gearing: Gearing, reversals: int, ratio: 
         answer, reason = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
     elif reversals < 2:
         answer, reason = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
-    elif gearing.is_loose and (half := _find_loose_gap(record, ratio, noise)) > max(noise, _BLURRED * gearing.twist):
+    elif gearing.is_loose and (half := _find_loose_gap(record, ratio)) > max(noise, _BLURRED * gearing.twist):
         answer, reason = "yes", f"the torque in the gear over the twist shows a half gap of about {half:.2g} {unit}"
     elif gearing.is_loose:
         reason = f"shift of {size} includes the wind-up, which this motion does not separate"
@@ -332,7 +332,7 @@ _BLURRED = 0.01
 """Half gap over the range of the twist that low-passed corners may make where there is none."""
 
 
-def _find_loose_gap(record: Record, ratio: float, noise: float) -> float:
+def _find_loose_gap(record: Record, ratio: float) -> float:
     """Roughly find the half gap, rad (m), from the twist and what the motor's own inertia and friction leave of the torque;
     0 where these show none."""
     torque, period = record.torque, record.sample_period
@@ -343,7 +343,7 @@ def _find_loose_gap(record: Record, ratio: float, noise: float) -> float:
     motion = [low_pass_motion(record.positions["motor"][segment], cutoff, period)[1:] for segment in record.segments]
     velocity, acceleration = np.concatenate(motion, axis=1)
     through = torque - fit.values[:3] @ np.stack([acceleration, velocity, smooth_sign(velocity)])
-    gear = fit_element(RigLog(compute_twist(record, ratio), through, record.segments, period, noise), linear=False)
+    gear = fit_element(make_rig_log(record, ratio)._replace(torque=through), linear=False)
     return 0.0 if gear is None or "half_gap" in gear.open or "gap" not in gear.terms else gear.numbers["half_gap"].value
 
 

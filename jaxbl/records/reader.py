@@ -264,7 +264,7 @@ def _resample_and_align(
             channels = {**channels, "u": channels["u"]._replace(hold=hold)}
             delays["u"] = Delay(skew)
             file.corrections |= {"u.skew": skew, "u.sampled": float(hold == "sampled")}
-            late = skew if hold == "zoh" else lateness.value
+            late = skew + (0.5 * segmented.period if hold == "sampled" else 0.0)
             lateness = lateness._replace(value=lateness.value - late)
             grid, gearing = resample()
     is_estimated = any(raw.skew == "estimate" for raw in channels.values())

@@ -59,6 +59,8 @@ def gain_axes(bound: float, alphas: Pair, lambdas: Pair) -> tuple[Axis, Axis]:
     )
 
 
+RESERVE_WORDS = "factor from these gains to the nearest that fail or err twice as much"
+"""What the reserve of gains is, behind its number."""
 _LEAST_RESERVE = 1.25
 """Factor by which gains may change until they fail, below which the card says so: f⁺ of a machine is known to about this."""
 

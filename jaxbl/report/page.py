@@ -76,7 +76,7 @@ def _card(result: Result, figure: str) -> str:
     steps = ""
     for i, step in enumerate(result.next_steps):
         # an option goes on in a new line as a whole
-        words = " ".join(f"<span>{escape(word)}</span>" for word in step.command.split(" "))
+        words = re.sub(r"\S+", r"<span>\g<0></span>", escape(step.command))
         steps += f"<dt>{'Or' if i else 'Next'}: {escape(step.answers)}</dt><dd><pre>{words}</pre></dd>"
     texts = [verdict, f'<p class="answer">{escape(result.headline)}</p>', f'<div class="keys">{keys}</div>' if keys else ""]
     return f'<section class="card"><div>{"".join(texts)}{f"<dl>{steps}</dl>" if steps else ""}</div>{figure}</section>'

@@ -22,7 +22,7 @@ from jaxbl.sweeps.sweep import StudyResult
 
 from .aggregates import Groups, Rows
 from .checks import values_of
-from .gain_plane import say_thin_reserve
+from .gain_plane import RESERVE_WORDS, say_thin_reserve
 from .maps import MARGINS, best_gains, draw as draw, laws_of, slope_text, value_words, with_value, worst_runs
 
 
@@ -64,11 +64,12 @@ def answer_sweep(result: StudyResult) -> Result:
         ]
         row = runs.reset_index().iloc[best.index]
         place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
-        as_good = f"{best.nearly_as_good} of {len(runs)} gains are as good within {100 * NEARLY_AS_GOOD:g} %"
         figures += [
             KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: worst velocity error, rms, of the best gains ({place})"),
             KeyFigure(
-                f"× {best.margin:.3g}", f"{side}: from these to the nearest that fail or err twice as much; {as_good}"
+                f"× {best.margin:.3g}",
+                f"{side}: {RESERVE_WORDS}; {best.nearly_as_good} of {len(runs)} gains are as good within "
+                f"{100 * NEARLY_AS_GOOD:g} %",
             ),
         ]
     # where gains are not varied, runs that fail are not what was sought

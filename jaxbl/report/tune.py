@@ -14,7 +14,15 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
 from .certificate import certificate_lines, certificate_tables, is_refuted, write_certificates
-from .gain_plane import EXACT, condition_curves, conditions_line, gain_axes, say_thin_reserve, usual_rule_curve
+from .gain_plane import (
+    EXACT,
+    RESERVE_WORDS,
+    condition_curves,
+    conditions_line,
+    gain_axes,
+    say_thin_reserve,
+    usual_rule_curve,
+)
 from .maps import cell_edges, colour_scale, flat_remark
 from .numbers import lead_with_doubt
 from .panels import MARKERS, Figure, Line, Map, Panel, literal, mark, with_unit
@@ -53,24 +61,18 @@ def _map(tuning: Tuning, side: str) -> Figure:
     for row, marker in zip(compared, cycle(MARKERS), strict=False):
         # a mark outside stands on the edge
         inside = alphas[0] <= row["alpha"] <= alphas[1] and lambdas[0] <= row["lambda"] <= lambdas[1]
-        name = literal(row["name"]) + " (off the map)" * (not inside)
-        parts += [mark(row["alpha"], row["lambda"], name, marker, 8.0)]
+        parts += [mark(row["alpha"], row["lambda"], literal(row["name"]) + " (off the map)" * (not inside), marker, 8.0)]
     parts += [mark(gains["alpha"], gains["lambda"], "tuned")]
     title = f"{side}: tuned ★ λ = {gains['lambda']:.3g} √rad/s, α = {gains['alpha']:.3g} rad/s²,  f⁺ = {bound:.3g} rad/s²"
     if flat := flat_remark(values):
         title = f"{title}\n{flat}"
     caption = (
         f"{side}: {label} over all runs, on the coarse map; above and on the right the axes of the atlas "
-        f"(jaxbl verify). Curves: the exact gain condition at the f⁺ of the pilot run, dotted with the margins "
+        "(jaxbl verify). Curves: the exact gain condition at the f⁺ of the pilot run, dotted with the margins "
         "asked for; the usual rule's gains for this f⁺ and larger ones. The other gains are compared below."
     )
     panel = Panel(*gain_axes(bound, alphas, lambdas), parts, title)
     return Figure(f"tuning_{side}", [panel], caption, width=6.4, height=4.8)
-
-
-def _missing(names: list[str]) -> str:
-    """Say what gains do that miss constraints."""
-    return " and ".join("does not converge" if name == "converged" else f"misses {name}" for name in names)
 
 
 _GAINS = ("lambda", "λ", "√rad/s"), ("alpha", "α", "rad/s²")
@@ -85,7 +87,7 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
     """Say what limits a gain towards one side, as part of a sentence."""
     if way["limit"] == "range":
         return f"outside of the range searched (tune.{'lambda' if symbol == 'λ' else 'alpha'}_ratio)"
-    missed = _missing(way["missed"])
+    missed = " and ".join("does not converge" if name == "converged" else f"misses {name}" for name in way["missed"])
     if way["at"] is None:
         return missed
     place = f"{symbol} = {way['at']:.3g} {unit}"
@@ -126,13 +128,12 @@ def describe(tuning: Tuning) -> Result:
         verdict, headline = "failed", "The search found an error above what was proven."
         remarks = [*certified, *doubts, *_reasons(summary)]
     details, holdout = [line for line in summary["remarks"] if line not in doubts], summary["holdout"]
-    where = f"On the held-out excitation ({holdout['excitation']['kind']})"
-    if holdout["same_excitation"]:
-        where = "On the study's excitation with other noise"
+    held_out = f"the held-out excitation ({holdout['excitation']['kind']})"
+    where = "the study's excitation with other noise" if holdout["same_excitation"] else held_out
     tables = [
         _gains_table(summary),
         *certificate_tables(summary),
-        _comparison_table(f"{where}, worst and median of all runs", holdout["rows"]),
+        _comparison_table(f"On {where}, worst and median of all runs", holdout["rows"]),
     ]
     return lead_with_doubt(
         Result(tuning.config.title or "Gains", verdict, headline, _key_figures(summary), remarks, details, tables)
@@ -161,12 +162,12 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
             for name, factor in factors.items()
             if "why_none" not in factor and factor[metric]["worst"] is not None
         )
-        meaning = f"{side}: worst {summary['objective']} error, rms{next(texts, '')}"
         figures += [
-            KeyFigure(f"{worst:.3g} {SIDE_METRICS[metric].unit}", meaning),
             KeyFigure(
-                f"× {verdict['margin']:.3g}", f"{side}: from these gains to the nearest that fail or err twice as much"
+                f"{worst:.3g} {SIDE_METRICS[metric].unit}",
+                f"{side}: worst {summary['objective']} error, rms{next(texts, '')}",
             ),
+            KeyFigure(f"× {verdict['margin']:.3g}", f"{side}: {RESERVE_WORDS}"),
         ]
     return figures
 

@@ -15,6 +15,7 @@ from small_study import ALPHA, LAMBDA, listed_axis, make_result, rigid_study, sm
 from jaxbl.files import write_atomic
 from jaxbl.lines import NextStep
 from jaxbl.report.drawing import Picture
+from jaxbl.report.gain_plane import RESERVE_WORDS
 from jaxbl.report.page import format_page
 from jaxbl.report.panels import pack_numbers
 from jaxbl.report.results import describe, write_report
@@ -112,7 +113,7 @@ def test_page_of_a_sweep(tmp_path):
         ("2.66 rad/s", "motor: worst velocity error, rms, of the best gains (alpha = 2.66, lambda = 2.71)"),
         (
             "× 2.66",
-            "motor: from these to the nearest that fail or err twice as much; 4 of 20 gains are as good within 5 %",
+            f"motor: {RESERVE_WORDS}; 4 of 20 gains are as good within 5 %",
         ),
     ]
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -281,6 +282,27 @@ def place(view, x, y):
     """Shares of a figure as pixels."""
     box = view.bounding_box()
     return {"x": x * box["width"], "y": y * box["height"]}
+
+
+@needs_chromium
+@pytest.mark.parametrize(("height", "shown"), [(316, 1037.0), (800, 650.0)])
+def test_a_flat_picture_has_the_width_of_the_page_and_is_seen_at_once(tmp_path, height, shown):
+    drawn = f'<svg xmlns="http://www.w3.org/2000/svg" width="1037" height="{height}"/>'.encode()
+    picture = Picture(drawn, (1037, height), "Maps.", "three maps, one beside the other", [])
+    figures = [KeyFigure(f"{i} rad/s", "motor: worst velocity error, rms, of the best gains") for i in range(4)]
+    command = "jaxbl tune results/gain_map/study.toml --out results/gain_map_gains"
+    steps = [NextStep(command, "Which gains have the least error?")] * 3
+    result = Result("a", "good", "The observer converges in 68.0 %. " * 3, figures, [], [], [], steps)
+    (tmp_path / "page.html").write_text(format_page(result, [("maps", picture)], "a = 1"), encoding="utf-8")
+    with open_pages(tmp_path / "page.html") as (page,):
+        page.set_viewport_size({"width": 1280, "height": 800})
+        if height < 800:
+            check_figures(page, 1)
+        view, answer, step = (page.locator(part).first.bounding_box() for part in (".view", ".answer", "dd"))
+        assert view["width"] == pytest.approx(shown, abs=40.0)
+        assert (view["y"] > answer["y"] + answer["height"]) == (step["y"] > view["y"] + view["height"]) == (height < 800)
+        # as it is copied: one line, whose options are whole
+        assert page.locator("dd pre").first.text_content() == command
 
 
 @needs_chromium

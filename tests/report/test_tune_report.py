@@ -117,7 +117,7 @@ def set_binding(summary, binding):
     return summary
 
 
-def test_map_and_sentence_name_the_constraint_that_binds(tuning):
+def test_a_sentence_and_a_table_name_the_constraint_that_binds(tuning):
     for binding in ([], ["margin_exact"]):
         result = dataclasses.replace(tuning, summary=set_binding(tuning.summary, binding))
         forbidden = "motor: a smaller error is forbidden by margin_exact."

@@ -574,7 +574,9 @@ def test_an_interrupted_study_replays_its_decisions_and_computes_nothing_twice(
     # the next one may have been computed while that was written
     assert computed_chunks in (list(range(stop + 1)), list(range(stop + 2)))
     assert not read_manifest(tmp_path / "study")["finished"]
-    assert "The study is not finished" in describe(open_study(tmp_path / "study")).remarks[0]
+    unfinished = open_study(tmp_path / "study")
+    runs = sum(map(len, unfinished.batches(["seed"])))
+    assert describe(unfinished).remarks[0].startswith(f"The study is not finished: {runs} runs so far")
     calls.clear()
     # with other chunks asked for: those of the folder stay
     result = sweep(study(chunk=4096), tmp_path / "study", progress=lambda *done: calls.append(done))
