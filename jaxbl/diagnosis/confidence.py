@@ -1,10 +1,10 @@
 """How sure a finding is: against other effects in its place, against its size, and by blocks of the log."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import expit, ndtr
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS, Numbers
@@ -14,6 +14,7 @@ from .effect_search import Explanation
 from .expected_errors import Expected
 from .fitted_model import FittedModel, special_case
 from .reference_log import Errors
+from .thresholds import LIMITS
 
 LEAST_CHANCE = 0.01
 """Alternatives of a lower probability are not listed."""
@@ -61,6 +62,24 @@ def _weigh(explanation: Explanation, name: str, left: float) -> Finding:
     weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
     alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
     return Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives)
+
+
+def confirm(findings: Sequence[Finding], shown: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Findings no surer than held-out data alone make an effect of the same prior odds.
+
+    Args:
+        findings: by the log.
+        shown: standard errors by which each effect that acts there makes the model predict held-out data better.
+    """
+    return tuple(_confirm(finding, shown.get(finding.effect, np.inf)) for finding in findings)
+
+
+def _confirm(finding: Finding, z: float) -> Finding:
+    chance = finding.confidence + sum(chance for _, chance in finding.alternatives)
+    # nats of a normal number of mean z over one of mean 0
+    part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / chance)
+    alternatives = tuple((name, part * chance) for name, chance in finding.alternatives)
+    return finding._replace(confidence=part * finding.confidence, alternatives=alternatives)
 
 
 def _certainty(fitted: FittedModel, name: str) -> float:

@@ -24,7 +24,7 @@ from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_cou
 
 from .blocks import standard_errors_better
 from .choice import Choice, Chosen
-from .confidence import explained_share
+from .confidence import confirm, explained_share
 from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_summary import (
     contradictions_of,
@@ -147,6 +147,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         # the model stands; only now what was held out is read
         announce("testing on held-out data")
         proof = prove(setup, chosen)
+        chosen = chosen._replace(findings=confirm(chosen.findings, proof.shown))
         share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
         apart = contradictions(task, fitted, setup.fitted, chosen.driving)
         judgement = judge(chosen, proof, share, bool(apart))
@@ -159,7 +160,10 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         observed = observed_torques(observing, setup.fitted.segments), unseen
         trace = trace_of(setup, proof, missing, observed)
         done()
-        summary = summary_of(setup, chosen, choice.search.history) | {"verdict": judgement.verdict, "explained_share": share}
+        summary = summary_of(setup, chosen, choice.search.history, proof.shown) | {
+            "verdict": judgement.verdict,
+            "explained_share": share,
+        }
         views, notes = describe_observers(observing, observed[0], setup)
         for side, witness in views.items():
             summary["where"][side]["observed"] = witness

@@ -32,6 +32,9 @@ from .refit import ModelFits, owner_of
 from .setup import Setup, quiet
 from .thresholds import LIMITS
 
+ACTS = 0.5
+"""Torque of an effect there, over that on the log, from which on it acts there, and can be shown."""
+
 
 class Proof(NamedTuple):
     """A model beside what was held out.
@@ -45,6 +48,7 @@ class Proof(NamedTuple):
         weak: channels that test nothing, since a complete model may leave more than the motion or the driving torque.
         untested: effects without which the model would pass as well: their torque there, and on the log that was fitted
             (`on_log`), N m, rms at the motor.
+        shown: standard errors by which each effect that acts there makes the model predict better.
         gap: errors before and after, and noise, as in `diagnosis.json`.
     """
 
@@ -57,6 +61,7 @@ class Proof(NamedTuple):
     worse: bool
     weak: list[str]
     untested: JsonObject
+    shown: dict[str, float]
     gap: JsonObject
 
     @property
@@ -105,13 +110,13 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     sizes = _sizes(log, fitted.experiment)
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
+    untested, shown = _leave_out_each(setup, chosen, log, after, expected)
     return Proof(
         record, log, before, after, expected,
         # what tests nothing contradicts nothing
         [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
-        weak,
-        _find_untested(setup, chosen, log, expected),
+        weak, untested, shown,
         _describe_gap(setup, record, log, before, after, sizes["torque_motor"]),
     )  # fmt: skip
 
@@ -134,15 +139,21 @@ def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
     return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
 
 
-def _find_untested(setup: Setup, chosen: Chosen, log: ReferenceLog, expected: Mapping[str, Expected]) -> JsonObject:
-    """Effects without which the model would leave no more than a complete one may."""
-    untested, model = {}, chosen.fitted.experiment
+def _leave_out_each(
+    setup: Setup, chosen: Chosen, log: ReferenceLog, after: Comparison, expected: Mapping[str, Expected]
+) -> tuple[JsonObject, dict[str, float]]:
+    """Leave out one effect after the other: those without which the model would leave no more than a complete one may, and
+    the standard errors by which it predicts better with each that acts there."""
+    untested, shown, model = {}, {}, chosen.fitted.experiment
     for name in chosen.fitted.names:
         less = without(model, name)
-        if not list_failed(log.with_slow(log.compare(less)), expected):
-            parts = {"torque": log, "on_log": setup.fitted}
-            untested[name] = {key: _torque_between(part, model, less) for key, part in parts.items()}
-    return untested
+        compared = log.compare(less)
+        torques = {key: _torque_between(part, model, less) for key, part in (("torque", log), ("on_log", setup.fitted))}
+        if torques["torque"] > ACTS * torques["on_log"]:
+            shown[name] = standard_errors_better(log, compared, after)
+        if not list_failed(log.with_slow(compared), expected):
+            untested[name] = torques
+    return untested, shown
 
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:

@@ -10,6 +10,7 @@ from jaxbl.diagnosis.coordinates import CoordinateValues
 from jaxbl.diagnosis.diagnose import Diagnosis
 from jaxbl.diagnosis.judgement import CHECKS
 from jaxbl.diagnosis.localise import Coordinate, Localised
+from jaxbl.diagnosis.proof import ACTS
 from jaxbl.diagnosis.residuals import Residual, narrow
 from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.json_types import JsonObject
@@ -99,9 +100,11 @@ def _reasons(summary: JsonObject) -> Lines:
                 f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
             )
         texts = ", ".join(f"{leaf} = {number}" for leaf, number in numbers.items())
+        z = finding.get("holdout_z")
+        shown = "" if z is None else f", shown by held-out data to {z:.1f} standard errors"
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
-            f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}."
+            f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}{shown}."
         )
         if alternatives:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in alternatives)
@@ -189,7 +192,7 @@ def _what_to_record(summary: JsonObject) -> str:
     if effects:
         lead = f"The held-out data would pass without it, too ({'; '.join(torques)})."
         # it acts there, but less than a complete model may leave
-        if all(torque["torque"] > 0.5 * torque["on_log"] for torque in effects.values()):
+        if all(torque["torque"] > ACTS * torque["on_log"] for torque in effects.values()):
             return (
                 f"{lead} Hold out a motion in which it is a larger part of the torque, or one that is read with less noise."
             )
