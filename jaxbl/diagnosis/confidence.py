@@ -64,14 +64,14 @@ def _weigh(explanation: Explanation, name: str, left: float) -> Finding:
     return Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives)
 
 
-def confirm(findings: Sequence[Finding], shown: Mapping[str, float]) -> tuple[Finding, ...]:
+def confirm(findings: Sequence[Finding], holdout_z: Mapping[str, float]) -> tuple[Finding, ...]:
     """Findings no surer than held-out data alone make an effect of the same prior odds.
 
     Args:
         findings: by the log.
-        shown: standard errors by which each effect that acts there makes the model predict held-out data better.
+        holdout_z: standard errors by which each effect that acts there makes the model predict held-out data better.
     """
-    return tuple(_confirm(finding, shown.get(finding.effect, np.inf)) for finding in findings)
+    return tuple(_confirm(finding, holdout_z.get(finding.effect, np.inf)) for finding in findings)
 
 
 def _confirm(finding: Finding, z: float) -> Finding:

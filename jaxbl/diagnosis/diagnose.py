@@ -147,7 +147,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         # the model stands; only now what was held out is read
         announce("testing on held-out data")
         proof = prove(setup, chosen)
-        chosen = chosen._replace(findings=confirm(chosen.findings, proof.shown))
+        chosen = chosen._replace(findings=confirm(chosen.findings, proof.holdout_z))
         share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
         apart = contradictions(task, fitted, setup.fitted, chosen.driving)
         judgement = judge(chosen, proof, share, bool(apart))
@@ -160,7 +160,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         observed = observed_torques(observing, setup.fitted.segments), unseen
         trace = trace_of(setup, proof, missing, observed)
         done()
-        summary = summary_of(setup, chosen, choice.search.history, proof.shown) | {
+        summary = summary_of(setup, chosen, choice.search.history, proof.holdout_z) | {
             "verdict": judgement.verdict,
             "explained_share": share,
         }

@@ -39,8 +39,8 @@ from .setup import Setup
 from .thresholds import LIMITS
 
 
-def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step], shown: Numbers) -> JsonObject:
-    """Make the summary but for the gap, the verdict, and what the observers say; `shown` as of a proof."""
+def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step], holdout_z: Numbers) -> JsonObject:
+    """Make the summary but for the gap, the verdict, and what the observers say; `holdout_z` as of a proof."""
     task, record, located = setup.task, setup.task.record, setup.located
     fitted, explanation = chosen.fitted, chosen.explanation
     where = where_lacking(record, located)
@@ -73,7 +73,7 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step], shown: Num
                 | {
                     "share": fitted.share(finding.effect),
                     "z": explanation.gains[finding.effect].standard_errors,
-                    "holdout_z": shown.get(finding.effect),
+                    "holdout_z": holdout_z.get(finding.effect),
                     "in_log": EFFECTS[finding.effect].in_log,
                 }
                 for finding in chosen.findings

@@ -48,7 +48,7 @@ class Proof(NamedTuple):
         weak: channels that test nothing, since a complete model may leave more than the motion or the driving torque.
         untested: effects without which the model would pass as well: their torque there, and on the log that was fitted
             (`on_log`), N m, rms at the motor.
-        shown: standard errors by which each effect that acts there makes the model predict better.
+        holdout_z: standard errors by which each effect that acts there makes the model predict better.
         gap: errors before and after, and noise, as in `diagnosis.json`.
     """
 
@@ -61,7 +61,7 @@ class Proof(NamedTuple):
     worse: bool
     weak: list[str]
     untested: JsonObject
-    shown: dict[str, float]
+    holdout_z: dict[str, float]
     gap: JsonObject
 
     @property
@@ -110,13 +110,13 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     sizes = _sizes(log, fitted.experiment)
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
-    untested, shown = _leave_out_each(setup, chosen, log, after, expected)
+    untested, holdout_z = _leave_out_each(setup, chosen, log, after, expected)
     return Proof(
         record, log, before, after, expected,
         # what tests nothing contradicts nothing
         [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
-        weak, untested, shown,
+        weak, untested, holdout_z,
         _describe_gap(setup, record, log, before, after, sizes["torque_motor"]),
     )  # fmt: skip
 
@@ -144,16 +144,16 @@ def _leave_out_each(
 ) -> tuple[JsonObject, dict[str, float]]:
     """Leave out one effect after the other: those without which the model would leave no more than a complete one may, and
     the standard errors by which it predicts better with each that acts there."""
-    untested, shown, model = {}, {}, chosen.fitted.experiment
+    untested, holdout_z, model = {}, {}, chosen.fitted.experiment
     for name in chosen.fitted.names:
         less = without(model, name)
         compared = log.compare(less)
         torques = {key: _torque_between(part, model, less) for key, part in (("torque", log), ("on_log", setup.fitted))}
         if torques["torque"] > ACTS * torques["on_log"]:
-            shown[name] = standard_errors_better(log, compared, after)
+            holdout_z[name] = standard_errors_better(log, compared, after)
         if not list_failed(log.with_slow(compared), expected):
             untested[name] = torques
-    return untested, shown
+    return untested, holdout_z
 
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:

@@ -101,10 +101,10 @@ def _reasons(summary: JsonObject) -> Lines:
             )
         texts = ", ".join(f"{leaf} = {number}" for leaf, number in numbers.items())
         z = finding.get("holdout_z")
-        shown = "" if z is None else f", shown by held-out data to {z:.1f} standard errors"
+        support = "" if z is None else f", shown by held-out data to {z:.1f} standard errors"
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
-            f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}{shown}."
+            f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}{support}."
         )
         if alternatives:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in alternatives)
