@@ -7,6 +7,7 @@ What the loops do not support (effects that read tables) is left to XLA. All is 
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import compress
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,10 +27,12 @@ from jaxbl.drive.parameters import get_leaf, set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.workers import map_in_threads
 
-from . import Leaves, Unsupported, program_cache
+from . import Leaves, program_cache
 
 _FLOAT = np.dtype(float)
 _NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
+_UNREADABLE = object()
+"""In place of leaves that are no numbers, such as tables: loops are not compiled where a step reads one."""
 
 
 class Direction(NamedTuple):
@@ -104,8 +107,7 @@ class PlantSimulator:
         structure = _PlantStructure.of(experiment, state)
         self.loop = _trajectory_loop(structure, self.sides)
         if self.loop is not None:
-            self.numbers, read = structure.read_numbers(experiment), _read_indices(structure)
-            self.places = [read.index(i) if i in read else -1 for i in _leaf_indices(structure, self.varied)]
+            self.numbers, self.places = structure.read_numbers(experiment), list(_find_places(structure, self.varied))
 
     def __call__(
         self,
@@ -126,9 +128,7 @@ class PlantSimulator:
         from .llvm import ArrayRows
 
         numbers = self.numbers.copy()
-        for place, path in zip(self.places, self.varied, strict=True):
-            if place >= 0:
-                numbers[place] = values[path]
+        numbers[self.places] = [values[path] for path in self.varied]
         # of each sample, torque first
         columns = [np.ascontiguousarray(column, float) for column in (torque, *(measured[side] for side in self.sides))]
         gains = [gain[side] for side in self.sides]
@@ -224,54 +224,53 @@ class _PlantStructure(NamedTuple):
 
     Attributes:
         experiment_tree: structure of the experiments.
-        leaf_types: shapes and types of the experiments' leaves.
+        is_number: for each leaf of the experiments, whether it is a number that steps may read.
         state_tree: structure of a plant's state.
     """
 
     experiment_tree: Any
-    leaf_types: tuple[tuple[tuple[int, ...], np.dtype], ...]
+    is_number: tuple[bool, ...]
     state_tree: Any
 
     @classmethod
     def of(cls, experiment: Experiment, state: PlantState) -> "_PlantStructure":
         leaves, tree = jax.tree.flatten(experiment)
-        types = tuple((np.shape(leaf), getattr(leaf, "dtype", None) or np.dtype(jnp.result_type(leaf))) for leaf in leaves)
-        return cls(tree, types, jax.tree.structure(state))
+        is_number = tuple(np.shape(leaf) == () and getattr(leaf, "dtype", _FLOAT) == _FLOAT for leaf in leaves)
+        return cls(tree, is_number, jax.tree.structure(state))
 
     @property
     def examples(self) -> tuple[Any, Any]:
-        """Experiment and state, with types in place of numbers and arrays."""
-        leaves = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in self.leaf_types]
+        """Experiment and state, with types in place of numbers."""
+        leaves = [_NUMBER if is_number else None for is_number in self.is_number]
         return self.experiment_tree.unflatten(leaves), self.state_tree.unflatten([_NUMBER] * self.state_tree.num_leaves)
 
+    @property
+    def number_examples(self) -> Leaves:
+        """Types of the numbers of an experiment."""
+        return [_NUMBER] * sum(self.is_number)
+
     def read_numbers(self, experiment: Experiment) -> np.ndarray:
-        """The numbers of an experiment that a step reads."""
-        leaves = jax.tree.leaves(experiment)
-        return np.array([float(leaves[i]) for i in _read_indices(self)])
+        """The numbers of an experiment."""
+        return np.array([np.asarray(leaf) for leaf in compress(jax.tree.leaves(experiment), self.is_number)], float)
 
     def stack_tangents(self, directions: Sequence[Direction]) -> np.ndarray:
-        """Directions as rows: changes of the numbers that a step reads, of the state's leaves, of the input."""
+        """Directions as rows: changes of the numbers, of the state's leaves, of the input."""
         paths = tuple(dict.fromkeys(path for direction in directions for path in direction.numbers))
-        leaf_of_path = dict(zip(paths, _leaf_indices(self, paths), strict=True))
-        column_of_leaf = {leaf: i for i, leaf in enumerate(_read_indices(self))}
+        places, count = dict(zip(paths, _find_places(self, paths), strict=True)), sum(self.is_number)
         rows = -(-len(directions) // _TOGETHER) * _TOGETHER
-        tangents = np.zeros((rows, len(column_of_leaf) + self.state_tree.num_leaves + 1))
+        tangents = np.zeros((rows, count + self.state_tree.num_leaves + 1))
         for row, direction in zip(tangents, directions, strict=False):
             for path, change in direction.numbers.items():
-                if leaf_of_path[path] in column_of_leaf:
-                    row[column_of_leaf[leaf_of_path[path]]] = change
+                row[places[path]] = change
             if len(direction.state):
-                row[len(column_of_leaf) : -1] = direction.state
+                row[count:-1] = direction.state
             row[-1] = direction.torque
         return tangents
 
     def build_experiment(self, numbers: Sequence[Any]) -> Experiment:
-        """The experiment from the numbers that a step reads; all other leaves are zero."""
-        # of NumPy, so that they leave no trace
-        leaves: Leaves = [np.zeros(shape, dtype) for shape, dtype in self.leaf_types]
-        for i, number in zip(_read_indices(self), numbers, strict=True):
-            leaves[i] = number
-        return self.experiment_tree.unflatten(leaves)
+        """The experiment from its numbers; what reads another leaf fails."""
+        remaining = iter(numbers)
+        return self.experiment_tree.unflatten(next(remaining) if is_number else _UNREADABLE for is_number in self.is_number)
 
     def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> Leaves:
         """Leaves of the plant's state one sample later."""
@@ -280,37 +279,10 @@ class _PlantStructure(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _leaf_indices(structure: _PlantStructure, paths: tuple[str, ...]) -> tuple[int, ...]:
-    """Indices of numbers among the experiment's leaves, by path."""
-    indices = structure.experiment_tree.unflatten(range(len(structure.leaf_types)))
-    return tuple(get_leaf(indices, path) for path in paths)
-
-
-@lru_cache(maxsize=64)
-def _read_indices(structure: _PlantStructure) -> tuple[int, ...]:
-    """Indices of the experiment's leaves that a step reads. Raises `Unsupported` if one of them is no number."""
-    key = program_cache.program_key("numbers read", *structure.examples)
-    indices = program_cache.load(key)
-    if indices is None:
-        indices = _find_read_indices(structure)
-        program_cache.save(key, indices)
-    return indices
-
-
-def _find_read_indices(structure: _PlantStructure) -> tuple[int, ...]:
-    from .jaxprs import trace_inlined
-
-    def step(leaves: Leaves, state: Leaves, torque: Any, time: Any) -> Leaves:
-        return structure.step(structure.experiment_tree.unflatten(leaves), state, torque, time)
-
-    leaves = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in structure.leaf_types]
-    closed = trace_inlined(step, leaves, [_NUMBER] * structure.state_tree.num_leaves, _NUMBER, _NUMBER)
-    read = {id(v) for eqn in closed.jaxpr.eqns for v in eqn.invars} | {id(v) for v in closed.jaxpr.outvars}
-    indices = tuple(i for i, v in enumerate(closed.jaxpr.invars[: len(leaves)]) if id(v) in read)
-    for i in indices:
-        if structure.leaf_types[i] != ((), _FLOAT):
-            raise Unsupported(f"steps that read {structure.leaf_types[i]}")
-    return indices
+def _find_places(structure: _PlantStructure, paths: tuple[str, ...]) -> tuple[int, ...]:
+    """Places of numbers among those of an experiment, by path."""
+    places = structure.experiment_tree.unflatten(np.cumsum(structure.is_number) - 1)
+    return tuple(get_leaf(places, path) for path in paths)
 
 
 @program_cache.compile_once
@@ -328,7 +300,7 @@ def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = ()) ->
         return structure.step(experiment, jax.tree.leaves(plant_state), torque, time), state
 
     count = structure.state_tree.num_leaves
-    constants = [_NUMBER] * len(_read_indices(structure)), _NUMBER, [_NUMBER] * (2 * len(sides))
+    constants = structure.number_examples, _NUMBER, [_NUMBER] * (2 * len(sides))
     index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
     examples = [_NUMBER] * count, *constants, index, inputs
     return sample, examples, {"carry": count, "lanes": 1, "constants": len(jax.tree.leaves(constants))}
@@ -359,7 +331,7 @@ def _derivatives_loop(structure: _PlantStructure) -> Any:
         return jax.tree.leaves(changes), new
 
     count = structure.state_tree.num_leaves
-    state, numbers = [_NUMBER] * count, [_NUMBER] * len(_read_indices(structure))
+    state, numbers = [_NUMBER] * count, structure.number_examples
     examples = state, _NUMBER, _NUMBER, numbers, [(numbers, state, _NUMBER)] * _TOGETHER
     constants = len(jax.tree.leaves(examples[3:]))
     return differentiate, examples, {"values": count + 2, "constants": constants}
