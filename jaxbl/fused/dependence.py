@@ -44,7 +44,7 @@ class LaneSplit(NamedTuple):
 
 
 class LoopHooks(NamedTuple):
-    """Jaxprs of scalars of one lane that run around the loop over the samples of a block.
+    """Jaxprs of scalars of one lane that run around the loop over the samples of a block; None: nothing runs there.
 
     Attributes:
         start: before the first block, values -> carry.
@@ -52,9 +52,12 @@ class LoopHooks(NamedTuple):
         finish: after the last block, values, carry, inputs -> results.
     """
 
-    start: ClosedJaxpr
-    after_block: ClosedJaxpr
-    finish: ClosedJaxpr
+    start: ClosedJaxpr = None
+    after_block: ClosedJaxpr = None
+    finish: ClosedJaxpr = None
+
+
+NO_HOOKS = LoopHooks()
 
 
 def find_carry_dependences(

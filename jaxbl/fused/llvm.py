@@ -9,15 +9,15 @@ from array import array
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import binding, ir
 
 from . import Unsupported
-from .dependence import LoopHooks
+from .dependence import NO_HOOKS, LoopHooks
 from .jaxprs import ClosedJaxpr, JaxprEqn
-from .scalar_writer import COMPARISONS, Rule, ScalarWriter
+from .scalar_writer import COMPARISONS, ScalarWriter
 
 _INT, _BIT, _POINTER = ir.IntType(64), ir.IntType(1), ir.PointerType()
 _MEMORY_TYPES = {
@@ -82,13 +82,7 @@ class ArraySpec(NamedTuple):
 
 
 def loop_signature(
-    body: ClosedJaxpr,
-    after_block: ClosedJaxpr | None,
-    finish: ClosedJaxpr | None,
-    values: int,
-    carry: int,
-    constants: int,
-    lane_inputs: int = 0,
+    body: ClosedJaxpr, hooks: LoopHooks, values: int, carry: int, constants: int, lane_inputs: int
 ) -> list[ArraySpec]:
     """The arrays of a loop in their order; arguments as for :class:`Loop` and :class:`LoopHooks`."""
     carry_end, read = values + carry, body.jaxpr.invars
@@ -99,11 +93,11 @@ def loop_signature(
         ("constant", "scalar", read[carry_end:inputs_start]),
         ("sample input", "samples", read[inputs_start:inputs_end]),
         ("lane's sample input", "samples and lanes", read[inputs_end:]),
-        ("block input", "blocks", after_block.jaxpr.invars[carry_end:] if after_block else []),
-        ("final input", "scalar", finish.jaxpr.invars[carry_end:] if finish else []),
+        ("block input", "blocks", hooks.after_block.jaxpr.invars[carry_end:] if hooks.after_block else []),
+        ("final input", "scalar", hooks.finish.jaxpr.invars[carry_end:] if hooks.finish else []),
         ("sample output", "samples and lanes", body.jaxpr.outvars[carry:]),
-        ("block flag", "blocks and lanes", after_block.jaxpr.outvars[carry:] if after_block else []),
-        ("result", "lanes", finish.jaxpr.outvars if finish else []),
+        ("block flag", "blocks and lanes", hooks.after_block.jaxpr.outvars[carry:] if hooks.after_block else []),
+        ("result", "lanes", hooks.finish.jaxpr.outvars if hooks.finish else []),
     ]
     arrays = [
         (f"{name} {i}", _LoopWriter.check_type(v.aval.dtype), extent)
@@ -128,8 +122,7 @@ class Loop:
         carry: how many numbers a lane carries from sample to sample.
         constants: how many numbers all lanes read unchanged in a call.
         lane_inputs: how many inputs of a sample each lane has for itself.
-        hooks: what runs before, between and after the blocks; left out, nothing.
-        after_block: what follows each block, where there are no `hooks`.
+        hooks: what runs before, between and after the blocks.
         lanes: that are computed together; left out, as many as suit the machine.
 
     Raises:
@@ -145,15 +138,13 @@ class Loop:
         carry: int = 0,
         constants: int = 0,
         lane_inputs: int = 0,
-        hooks: LoopHooks | None = None,
-        after_block: ClosedJaxpr | None = None,
+        hooks: LoopHooks = NO_HOOKS,
         lanes: int | None = None,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        after_block = hooks.after_block if hooks else after_block
-        self.signature = loop_signature(body, after_block, hooks and hooks.finish, values, carry, constants, lane_inputs)
+        self.signature = loop_signature(body, hooks, values, carry, constants, lane_inputs)
         module = ir.Module("loop")
-        _LoopWriter(module, self.lanes).write_loop(body, hooks, after_block, self.signature)
+        _LoopWriter(module, self.lanes).write_loop(body, hooks, self.signature)
         parsed = binding.parse_assembly(str(module))
         options = binding.create_pipeline_tuning_options(speed_level=3)
         passes = binding.create_pass_builder(_target_machine(), options)
@@ -282,23 +273,13 @@ class _LoopWriter(ScalarWriter):
     """Writes jaxprs as LLVM assembly; every number is a vector of lanes."""
 
     number_types = _MEMORY_TYPES
-    own_rules: ClassVar[dict[str, Rule]] = {
-        "clamp": lambda w, eqn, dtype, low, a, high: w.emit("min", dtype, w.emit("max", dtype, low, a), high),
-        "is_finite": lambda w, eqn, dtype, a: w.emit("lt", dtype, w.emit("abs", dtype, a), w.literal(np.inf, dtype)),
-    }
 
     def __init__(self, module: ir.Module, lanes: int):
         self.module, self.lanes = module, lanes
         self.invariants: set[Vector] = set()
         """Vectors that do not change in the loop over time."""
 
-    def write_loop(
-        self,
-        body: ClosedJaxpr,
-        hooks: LoopHooks | None,
-        after_block: ClosedJaxpr | None,
-        signature: Sequence[ArraySpec],
-    ) -> None:
+    def write_loop(self, body: ClosedJaxpr, hooks: LoopHooks, signature: Sequence[ArraySpec]) -> None:
         function_type = ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _SCALAR_ARGUMENTS])
         function = ir.Function(self.module, function_type, "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
@@ -354,28 +335,30 @@ class _LoopWriter(ScalarWriter):
                 write("sample output", results[carry_count:], index)
                 return results[:carry_count]
 
-            if after_block is None:
-                return write("carry", self.write_for(start, steps, read("carry"), write_sample), lane)
-
             def write_block(block_start: Vector, carry: list[Vector]) -> list[Vector]:
                 block_end = build.add(block_start, block_length)
                 last = build.select(build.icmp_signed("<", block_end, steps), block_end, steps)
                 carry = self.write_for(block_start, last, carry, write_sample)
                 block = build.sdiv(block_start, block_length)
                 inputs = (broadcast(i, block) for i in places["block input"])
-                results = self.write_jaxpr(after_block, [*values, *carry, *inputs])
+                results = self.write_jaxpr(hooks.after_block, [*values, *carry, *inputs])
                 index = build.add(build.mul(block, width), lane)
                 write("block flag", results[carry_count:], index)
                 return results[:carry_count]
 
-            if hooks is None:
-                return write("carry", self.write_for(start, steps, read("carry"), write_block, step=block_length), lane)
-            start_jaxpr, finish = hooks.start, hooks.finish
-            carry = self.write_if(begins, lambda: self.write_jaxpr(start_jaxpr, values), lambda: read("carry"))
-            carry = self.write_for(start, steps, carry, write_block, step=block_length)
+            if hooks.start is None:
+                carry = read("carry")
+            else:
+                carry = self.write_if(begins, lambda: self.write_jaxpr(hooks.start, values), lambda: read("carry"))
+            if hooks.after_block is None:
+                carry = self.write_for(start, steps, carry, write_sample)
+            else:
+                carry = self.write_for(start, steps, carry, write_block, step=block_length)
+            if hooks.finish is None:
+                return write("carry", carry, lane)
             return self.write_if(
                 ends,
-                lambda: write("result", self.write_jaxpr(finish, [*values, *carry, *final_inputs]), lane),
+                lambda: write("result", self.write_jaxpr(hooks.finish, [*values, *carry, *final_inputs]), lane),
                 lambda: write("carry", carry, lane),
             )
 

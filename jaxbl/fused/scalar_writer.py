@@ -5,7 +5,7 @@ operations, for which each language has its own words.
 """
 
 import abc
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import reduce
 from typing import Any, ClassVar
 
@@ -36,12 +36,10 @@ class ScalarWriter(abc.ABC):
     Attributes:
         number_types: of the numbers that the language has.
         arrays: what a message calls numbers that are no scalars.
-        own_rules: rules of the language that come before those that all share, by primitive.
     """
 
     number_types: ClassVar[Collection[str]]
     arrays = "arrays"
-    own_rules: ClassVar[Mapping[str, Rule]] = {}
 
     # what a language says
 
@@ -116,9 +114,7 @@ class ScalarWriter(abc.ABC):
         is_float = dtype.kind == "f"
         if name in FUNCTIONS and is_float:
             return self.write_call(trace_scalar_function(FUNCTIONS[name], dtype), operands)
-        rule = (
-            self.own_rules.get(name) or (_FLOAT_RULES if is_float else _INTEGER_RULES).get(name) or _COMMON_RULES.get(name)
-        )
+        rule = (_FLOAT_RULES if is_float else _INTEGER_RULES).get(name) or _COMMON_RULES.get(name)
         return self.write_unknown(eqn, operands, str(dtype)) if rule is None else [rule(self, eqn, dtype, *operands)]
 
 
@@ -179,7 +175,7 @@ _INTEGER_RULES = _operation_rules(
 _COMMON_RULES: dict[str, Rule] = {
     **_operation_rules(*COMPARISONS, "max", "min"),
     "sign": _sign,
-    "clamp": lambda w, eqn, dtype, low, a, high: w.emit("min", dtype, w.emit("max", dtype, a, low), high),
+    "clamp": lambda w, eqn, dtype, low, a, high: w.emit("min", dtype, w.emit("max", dtype, low, a), high),
     "select_n": _select,
     "convert_element_type": lambda w, eqn, dtype, a: w.convert(a, dtype, w.check_type(_type_of(eqn.outvars[0]))),
     "bitcast_convert_type": lambda w, eqn, dtype, a: w.bitcast(a, w.check_type(_type_of(eqn.outvars[0]))),

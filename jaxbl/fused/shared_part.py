@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import Leaves, Unsupported
-from .dependence import split_by_state
+from .dependence import LoopHooks, split_by_state
 from .jaxprs import trace_inlined
 from .llvm import Loop
 from .noise import LONGEST_SPAN, draw_noise
@@ -109,7 +109,7 @@ class SharedPartLoop:
             count = len(part.state)
             self._block_dtypes = [out.dtype for out in end_block.out_avals[count:]]
             self._sample_dtypes = [out.dtype for out in split.step.out_avals[count:]]
-            self._loop = Loop(split.step, np.dtype(float), carry=count, lanes=1, after_block=end_block)
+            self._loop = Loop(split.step, np.dtype(float), carry=count, hooks=LoopHooks(after_block=end_block), lanes=1)
 
     def __call__(self, state: Leaves, seed: int, first: int, count: int) -> SharedValues:
         part = self._part

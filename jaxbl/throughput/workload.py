@@ -5,7 +5,7 @@ recorded. Every lane has a dead zone, a noise level and gains of its own; all sh
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -174,16 +174,25 @@ def chain_constants() -> dict[str, float]:
     }
 
 
-def metrics_from_sums(workload: Workload, sums: list[np.ndarray]) -> Metrics:
-    """Figures `(lanes,)` from the nine sums over the run that rivals keep: of products of both regressors (3), of regressors
-    and torques (2 a side), of squared velocity errors (1 each)."""
-    twist_squares, products, bend_squares, *side_sums = (np.asarray(column, np.float64) for column in sums)
+def identify_from_sums(sums: Sequence[np.ndarray]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Stiffness and dead zone `(lanes,)` by side, from seven sums over the run: of products of both regressors (3), of
+    regressors and torques (2 a side)."""
+    twist_squares, products, bend_squares, *moments = (np.asarray(column, np.float64) for column in sums)
     determinant = twist_squares * bend_squares - products * products
-    metrics = {}
+    identified = {}
     for i, side in enumerate(SIDES):
-        twist_torque, bend_torque = side_sums[2 * i : 2 * i + 2]
+        twist_torque, bend_torque = moments[2 * i : 2 * i + 2]
         stiffness = (bend_squares * twist_torque - products * bend_torque) / determinant
-        metrics[f"{side}.velocity_rmse"] = np.sqrt(side_sums[4 + i] / (workload.steps - workload.window))
-        metrics[f"{side}.stiffness"] = stiffness
-        metrics[f"{side}.dead_zone"] = (twist_squares * bend_torque - products * twist_torque) / determinant / stiffness
+        dead_zone = (twist_squares * bend_torque - products * twist_torque) / determinant / stiffness
+        identified[side] = stiffness, dead_zone
+    return identified
+
+
+def metrics_from_sums(workload: Workload, sums: list[np.ndarray]) -> Metrics:
+    """Figures `(lanes,)` from the nine sums over the run that rivals keep: those of :func:`identify_from_sums`, and of
+    squared velocity errors (1 a side)."""
+    identified, metrics = identify_from_sums(sums[:7]), {}
+    for side, squares in zip(SIDES, sums[7:], strict=True):
+        metrics[f"{side}.velocity_rmse"] = np.sqrt(np.asarray(squares, np.float64) / (workload.steps - workload.window))
+        metrics[f"{side}.stiffness"], metrics[f"{side}.dead_zone"] = identified[side]
     return metrics

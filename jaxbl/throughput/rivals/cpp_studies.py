@@ -14,19 +14,11 @@ from jaxbl.drive import get_leaf
 from jaxbl.sweeps.metrics import window_start
 
 from ..studies import BenchStudy
-from ..workload import SIDES, Metrics
+from ..workload import DRIVE, RANGES, SIDES, Metrics, chain_constants, identify_from_sums
 from .cpp_chain import PADDING, array_pointers, compile_library
 
-_NUMBER_NAMES = (
-    "period", "motor_inertia", "motor_viscous", "load_inertia", "load_viscous", "gear_ratio", "stiffness", "slope", "share",
-    "motor_error", "position_tolerance", "velocity_tolerance",
-)  # fmt: skip
+_NUMBER_NAMES = *chain_constants(), "position_tolerance", "velocity_tolerance"
 _COUNT_NAMES = "steps", "substeps", "block", "start", "window"
-_VALUE_PATHS = (
-    "observer.motor.alpha", "observer.motor.lambda", "observer.load.alpha", "observer.load.lambda", "transmission.dead_zone",
-    "encoders.noise",
-)  # fmt: skip
-"""What lanes may differ in, as studies.cpp numbers it."""
 _CARRY = (
     "last", "position", "velocity", "torque", "position_size", "velocity_size", "chatter", "previous", "perturbation",
     "acceleration",
@@ -54,7 +46,7 @@ class CppStudy:
         law: Any = experiment.transmission
         numbers = {
             "period": run.sample_period,
-            **{name: float(getattr(experiment.drive, name)) for name in _NUMBER_NAMES[1:6]},
+            **{name: float(getattr(experiment.drive, name)) for name in DRIVE},
             "stiffness": float(law.stiffness),
             "slope": float(law.slope),
             "share": -np.expm1(-run.sample_period / float(experiment.equivalent_control.time_constant)),
@@ -69,9 +61,9 @@ class CppStudy:
         self._constants = _StudyConstants(**numbers, **dict(zip(_COUNT_NAMES, counts, strict=True)))
         self._has_lane_plants = any(path.startswith(("transmission.", "drive.")) for path in study.values)
         lanes = -(-study.lanes // PADDING) * PADDING
+        # studies.cpp numbers what lanes may differ in as `RANGES` does
         self._values = [
-            np.resize(study.values.get(path, [float(get_leaf(experiment, path))]), lanes).astype(float)
-            for path in _VALUE_PATHS
+            np.resize(study.values.get(path, [float(get_leaf(experiment, path))]), lanes).astype(float) for path in RANGES
         ]
         self._out = [np.zeros(lanes) for _ in range(2 * len(_CARRY) + _SUM_COUNT)]
         with precision(study.config):
@@ -99,22 +91,14 @@ class CppStudy:
         )  # fmt: skip
         study, run = self._study, self._study.config.run
         out = [column[: study.lanes] for column in self._out]
-        gap, (twist_squares, products, bend_squares) = (
-            self._values[4][: study.lanes],
-            out[2 * len(_CARRY) : 2 * len(_CARRY) + 3],
-        )
-        norm = np.sqrt(twist_squares) * np.sqrt(bend_squares)
-        correlation = products / norm
-        determinant = 1.0 - correlation * correlation
+        gap, sums = self._values[4][: study.lanes], out[2 * len(_CARRY) :]
+        twist_squares, products, bend_squares = sums[:3]
+        correlation = products / (np.sqrt(twist_squares) * np.sqrt(bend_squares))
+        identified = identify_from_sums(sums)
         count, metrics = run.steps - self._window, {}
         for i, side in enumerate(SIDES):
             carry = dict(zip(_CARRY, out[i * len(_CARRY) :], strict=False))
-            twist_torque, bend_torque = (
-                out[2 * len(_CARRY) + 3 + 2 * i + j] / np.sqrt(square_sum)
-                for j, square_sum in enumerate((twist_squares, bend_squares))
-            )
-            stiffness = (twist_torque - correlation * bend_torque) / (determinant * np.sqrt(twist_squares))
-            product = (bend_torque - correlation * twist_torque) / (determinant * np.sqrt(bend_squares))
+            stiffness, dead_zone = identified[side]
             converged = carry["last"] < (self._window - 0.5) * run.sample_period
             entered = np.where(carry["last"] < 0.0, 0.0, carry["last"] + run.sample_period)
             metrics |= {
@@ -126,7 +110,7 @@ class CppStudy:
                 f"{side}.f_plus": carry["perturbation"].copy(),
                 f"{side}.f_plus_acceleration": 2.0 * carry["acceleration"],
                 f"{side}.stiffness_error": stiffness / self._constants.stiffness - 1.0,
-                f"{side}.dead_zone_error": product / stiffness / gap - 1.0,
+                f"{side}.dead_zone_error": dead_zone / gap - 1.0,
                 f"{side}.excitation": 1.0 - np.abs(correlation),
             }
         return metrics
