@@ -117,19 +117,19 @@ def _members_by_name(members: tuple) -> dict[str, Any]:
     return {name if names.count(name) == 1 else str(i): members[i] for i, name in enumerate(names)}
 
 
-def _first_key(tree: Any, path: str) -> tuple[str, str]:
-    """Return the name of the member that a dotted path begins with, and the path within it. Raises `KeyError`."""
+def _first_member(tree: Any, path: str) -> tuple[str, Any, str]:
+    """Return the member that a dotted path begins with, after its name, and the path within it. Raises `KeyError`."""
     if isinstance(tree, tuple):
         members, keys = _members_by_name(tree), path.split(".")
         # the name of a member may have dots (`load.coulomb_friction`)
         for count in range(1, len(keys) + 1):
             if (name := ".".join(keys[:count])) in members:
-                return name, ".".join(keys[count:])
+                return name, members[name], ".".join(keys[count:])
     else:
         name, _, subpath = path.partition(".")
         name = f"{name}_" if keyword.iskeyword(name) else name
         if hasattr(tree, name):
-            return name, subpath
+            return name, getattr(tree, name), subpath
     raise KeyError(path)
 
 
@@ -138,10 +138,9 @@ def get_leaf(tree: Any, path: str) -> Any:
     remaining = path
     while remaining:
         try:
-            name, remaining = _first_key(tree, remaining)
+            _, tree, remaining = _first_member(tree, remaining)
         except KeyError:
             raise KeyError(path) from None
-        tree = _members_by_name(tree)[name] if isinstance(tree, tuple) else getattr(tree, name)
     return tree
 
 
@@ -151,16 +150,17 @@ def set_leaves(tree: Tree, values: Mapping[str, Any]) -> Tree:
     Example:
         >>> stiffer = set_leaves(experiment, {"transmission.stiffness": 2.0, "observer.motor.alpha": 30.0})
     """
+    members: dict[str, Any] = {}
     by_member: dict[str, dict[str, Any]] = {}
     for path, value in values.items():
-        name, subpath = _first_key(tree, path)
+        name, member, subpath = _first_member(tree, path)
+        members[name] = member
         by_member.setdefault(name, {})[subpath] = value
     if not by_member:
         return tree
-    members = _members_by_name(tree) if isinstance(tree, tuple) else {name: getattr(tree, name) for name in by_member}
     changed = {name: new[""] if "" in new else set_leaves(members[name], new) for name, new in by_member.items()}
     if isinstance(tree, tuple):
-        return tuple((members | changed).values())  # type: ignore[return-value]
+        return tuple((_members_by_name(tree) | changed).values())  # type: ignore[return-value]
     return dataclasses.replace(tree, **changed)  # type: ignore[type-var]
 
 
