@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -30,14 +30,8 @@ _LONG_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){50}""")
 """A key of fifty parts, which `tomllib` takes quadratic time for."""
 
 
-class Origin(NamedTuple):
-    """The file that a key came from, and the keys within it."""
-
-    file: str
-    keys: "Origins"
-
-
-Origins = dict[str, Origin]
+Layers = list[tuple[str, JsonObject]]
+"""The files that a study was merged from, each with its keys; those of later ones win."""
 
 
 def read_config(source: ConfigSource) -> Config:
@@ -46,8 +40,6 @@ def read_config(source: ConfigSource) -> Config:
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
-    if isinstance(source, Config):
-        return _validate("config", source.to_dict(), {})
     return _validate(*_read_with_includes(source))
 
 
@@ -64,9 +56,9 @@ def read_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     Raises:
         InputError: as :func:`read_config`.
     """
-    config, missing = _read_model_of_any_log(source)
+    name, config, missing = _read_model_of_any_log(source)
     if config.log.kind == "element":
-        raise InputError(_ELEMENT.format(source if isinstance(source, str | Path) else "config"))
+        raise InputError(_ELEMENT.format(name))
     return config, missing
 
 
@@ -76,21 +68,9 @@ _ELEMENT = (
 )
 
 
-def _read_model_of_any_log(source: ConfigSource) -> tuple[Config, frozenset[str]]:
-    """Read a model as :func:`read_model` does, for any kind of log."""
-    config, missing = _fill_in_model(source)
-    if (kind := config.drive.kind) not in ("two_inertia", "rigid"):
-        raise InputError(
-            f"{source if isinstance(source, str | Path) else 'config'}: drive.kind: logs are held against drives of kind "
-            f"two_inertia or rigid, not {kind}; simulate, sweep, tune and export take it"
-        )
-    return config, missing
-
-
-def _fill_in_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
-    if isinstance(source, Config):
-        return read_config(source), frozenset()
-    name, data, origins = _read_with_includes(source)
+def _read_model_of_any_log(source: ConfigSource) -> tuple[str, Config, frozenset[str]]:
+    """Read a model as :func:`read_model` does, for any kind of log. Returns its name for messages, too."""
+    name, data, layers = _read_with_includes(source)
     log = data.get("log")
     if isinstance(log, dict) and log.get("kind") == "element" and "drive" not in data:
         raise InputError(_ELEMENT.format(name))
@@ -104,24 +84,33 @@ def _fill_in_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
         if isinstance(observer, dict) and side not in observer:
             missing.add(f"observer.{side}")
             observer[side] = dict(_MISSING_GAINS)
-    return _validate(name, data, origins), frozenset(missing)
+    config = _validate(name, data, layers)
+    if (kind := config.drive.kind) not in ("two_inertia", "rigid"):
+        raise InputError(
+            f"{name}: drive.kind: logs are held against drives of kind two_inertia or rigid, not {kind}; simulate, sweep, "
+            "tune and export take it"
+        )
+    return name, config, frozenset(missing)
 
 
-def _read_with_includes(source: str | Path | Mapping[str, Any]) -> tuple[str, JsonObject, Origins]:
-    """Read a study with its included files. Returns its name for messages, the data, and the file of each key."""
+def _read_with_includes(source: ConfigSource) -> tuple[str, JsonObject, Layers]:
+    """Read a study with its included files. Returns its name for messages, the data, and the files."""
+    layers: Layers = []
+    if isinstance(source, Config):
+        return "config", source.to_dict(), layers
     if isinstance(source, Mapping):
         data = dict(source)
         try:
             check_sizes(data)
         except InputError as error:
             raise InputError(f"config: {error}") from None
-        return "config", *_merge_includes(copy.deepcopy(data), "config", Path(), [], [])
+        return "config", _merge_includes(copy.deepcopy(data), "config", Path(), [], layers), layers
     if not isinstance(source, str | Path):
         raise InputError(
             f"a study should be a TOML file, a mapping or a config, not {type(source).__name__}; an Experiment, whose drive "
             "may be one of your own, is for jaxbl.simulate, metrics, observe and sweep_arrays"
         )
-    return str(Path(source)), *_file(Path(source), [], [])
+    return str(Path(source)), _file(Path(source), [], layers), layers
 
 
 def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | None]:
@@ -130,24 +119,23 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     Raises:
         InputError: unreadable file, bad TOML, unknown key, wrong type or range; one line that names file and key.
     """
-    data, _ = _file(path, [], [])
+    data = _file(path, [], [])
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None, None
-    config, _ = _read_model_of_any_log(path)
+    _, config, _ = _read_model_of_any_log(path)
     ratio = getattr(config.drive, "gear_ratio", None)
     return config.log, ratio, config.nominal_drive()
 
 
-def _file(path: Path, chain: list[Path], read: list[Path]) -> tuple[JsonObject, Origins]:
-    """A TOML file with what it includes; `chain` are the files that led here, `read` all so far. Files that it names become
-    absolute."""
+def _file(path: Path, chain: list[Path], layers: Layers) -> JsonObject:
+    """A TOML file with what it includes; `chain` are the files that led here, and `layers` gets those that were read. Files that
+    it names become absolute."""
     data = _load(path)
-    read.append(path)
     tune = data.get("tune")
     for table in (data.get("excitation"), data.get("reference"), tune.get("holdout") if isinstance(tune, dict) else None):
         if isinstance(table, dict) and isinstance(table.get("file"), str):
             table["file"] = str((path.parent / table["file"]).resolve())
-    return _merge_includes(data, str(path), path.parent, [*chain, path.resolve()], read)
+    return _merge_includes(data, str(path), path.parent, [*chain, path.resolve()], layers)
 
 
 def _load(path: Path) -> JsonObject:
@@ -179,19 +167,16 @@ def _load(path: Path) -> JsonObject:
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
-def _merge_includes(
-    data: JsonObject, name: str, folder: Path, chain: list[Path], read: list[Path]
-) -> tuple[JsonObject, Origins]:
-    """Merge the included files (relative to `folder`) into the data. Returns it, and the file of each key."""
+def _merge_includes(data: JsonObject, name: str, folder: Path, chain: list[Path], layers: Layers) -> JsonObject:
+    """Merge the data over the files that it includes (relative to `folder`)."""
     files = data.pop("include", [])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         raise InputError(f"{name}: include: should be a file name or an array of them, not {abbreviate(files)}")
     merged: JsonObject = {}
-    origins: Origins = {}
     for file in files:
         path = folder / file
-        if len(read) > _MOST_FILES:
+        if len(layers) + len(chain) > _MOST_FILES:
             raise InputError(
                 f"{name}: include: more than {_MOST_FILES} files, with those that they include; fewer are needed"
             )
@@ -202,21 +187,14 @@ def _merge_includes(
             raise InputError(f"{name}: include: {path}: {reason}") from None
         if path.resolve() in chain:
             raise InputError(f"{name}: include: {path} includes this file in turn; files should not include one another")
-        _merge(merged, *_file(path, chain, read), origins)
-    _merge(merged, data, _origins_from_file(data, name), origins)
-    return merged, origins
+        _merge(merged, _file(path, chain, layers))
+    layers.append((name, data))
+    _merge(merged, data)
+    return merged
 
 
-def _origins_from_file(data: Mapping[str, Any], file: str) -> Origins:
-    """Return origins of keys that all come from one file."""
-    return {
-        name: Origin(file, _origins_from_file(element, file) if isinstance(element, Mapping) else {})
-        for name, element in data.items()
-    }
-
-
-def _merge(into: JsonObject, data: JsonObject, new: Origins, origins: Origins) -> None:
-    """Put the keys of `data` over those of `into`, and `new` over their `origins`."""
+def _merge(into: JsonObject, data: JsonObject) -> None:
+    """Put the keys of `data` over those of `into`."""
     for name, value in data.items():
         old = into.get(name)
         # a table of another kind is another table
@@ -225,23 +203,29 @@ def _merge(into: JsonObject, data: JsonObject, new: Origins, origins: Origins) -
             and isinstance(value, dict)
             and all(tag not in old or value.get(tag, old[tag]) == old[tag] for tag in ("kind", "law"))
         ):
-            origins[name] = Origin(new[name].file, origins[name].keys)
-            _merge(old, value, new[name].keys, origins[name].keys)
+            _merge(old, value)
         else:
-            into[name], origins[name] = value, new[name]
+            into[name] = value
 
 
-def _validate(name: str, data: JsonObject, origins: Origins) -> Config:
+def _validate(name: str, data: JsonObject, layers: Layers) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        place, text = _describe(error)
-        # the file that the key came from, where that is not the one asked for
-        for key in place:
-            if key not in origins:
-                break
-            name, origins = origins[key]  # type: ignore[index]
+        key, text = _describe(error)
+        # the file that the key, or as much of it as there is, came from
+        held = _count_held(key, data)
+        name = next((file for file, layer in reversed(layers) if _count_held(key[:held], layer) == held), name)
         raise InputError(f"{name}: {text}" if name else text) from None
+
+
+def _count_held(key: Key, table: Any) -> int:
+    """Count the parts of a key, from the first on, that a table holds."""
+    for count, part in enumerate(key):
+        if not isinstance(table, Mapping) or part not in table:
+            return count
+        table = table[part]
+    return len(key)
 
 
 _UNIONS = {(key,): 1 for key in ("drive", "transmission", "excitation", "observer", "controller", "reference")} | {
@@ -288,4 +272,4 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
         if type(target.get(key)) is int and isinstance(value, float) and value.is_integer():
             value = int(value)  # a whole number from start, stop and num
         target[key] = value
-    return _validate("", data, {})
+    return _validate("", data, [])
