@@ -145,7 +145,7 @@ class Cluster:
     def _result(self, future: Any) -> Any:
         from distributed import KilledWorker
 
-        if future.status == "cancelled" or future.status == "lost":
+        if future.status in ("cancelled", "lost"):
             raise NoResult(_LOST)
         try:
             return future.result()

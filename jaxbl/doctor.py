@@ -37,7 +37,7 @@ def examine() -> list[Finding]:
         *_check_packages(),
         Finding("devices", _describe_devices()),
         _check_cache(),
-        _check_results_folder(Path()),
+        _check_results_folder(),
     ]
     for name, test in (("one run", _test_one_run), ("two backends", _test_two_backends)):
         announce(f"testing {name}")
@@ -96,9 +96,9 @@ def _check_cache() -> Finding:
     return Finding("cache", f"{folder}, {size / 1e6:.0f} MB; it may be deleted at any time")
 
 
-def _check_results_folder(folder: Path) -> Finding:
+def _check_results_folder() -> Finding:
     """Check the folder for results."""
-    where = folder.absolute()
+    where = Path.cwd()
     if os.access(where, os.W_OK):
         return Finding("results", f"{where / 'results'}")
     return Finding("results", f"{where} cannot be written to; go to another folder, or give --out", False)

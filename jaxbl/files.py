@@ -148,9 +148,9 @@ def write_atomic(path: Path, content: str | bytes | bytearray) -> None:
                 draft.unlink()
 
 
-def write_json(path: Path, data: Any, *, allow_nan: bool = True) -> None:
+def write_json(path: Path, data: Any) -> None:
     """Write data as JSON text. Raises as :func:`write_atomic`."""
-    write_atomic(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=allow_nan))
+    write_atomic(path, json.dumps(data, indent=2, ensure_ascii=False))
 
 
 def list_paths(folder: Path, pattern: str) -> list[Path]:

@@ -14,12 +14,11 @@ from .tables import Table, declare_key
 
 
 class _SpanTable(Table):
-    start: float
-    stop: float
+    """A table with `start` and `stop`, either of which may be left out where its class allows it."""
 
     @model_validator(mode="after")
     def _check_order(self) -> "_SpanTable":
-        if self.start >= self.stop:
+        if self.start is not None and self.stop is not None and self.start >= self.stop:
             raise table_error(f"start {self.start} should be less than stop {self.stop}")
         return self
 
@@ -45,18 +44,12 @@ class GainPairTable(Table):
     alpha: float = declare_key("gain alpha", unit="rad/s²", ge=0.0)
 
 
-class LoopGainTable(Table):
+class LoopGainTable(_SpanTable):
     """A gain of a closed loop that is searched together with others."""
 
     path: str = declare_key("dotted path of the gain, e.g. controller.position_gain")
     start: float | None = declare_key("least value tried; left out: a tenth of the study's", None, gt=0.0)
     stop: float | None = declare_key("largest value tried; left out: ten times the study's", None, gt=0.0)
-
-    @model_validator(mode="after")
-    def _check_order(self) -> "LoopGainTable":
-        if self.start is not None and self.stop is not None and self.start >= self.stop:
-            raise table_error(f"start {self.start} should be less than stop {self.stop}")
-        return self
 
 
 LOOP_OBJECTIVES = {"following": "following_rmse", "settling": "settling_time", "limit_cycle": "limit_cycle_amplitude"}

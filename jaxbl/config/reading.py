@@ -128,7 +128,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
 
 
 def _file(path: Path, chain: list[Path], layers: Layers) -> JsonObject:
-    """A TOML file with what it includes; `chain` are the files that led here, and `layers` gets those that were read. Files that
+    """A TOML file with what it includes; `chain` are the files that led here, `layers` gets those that were read. Files that
     it names become absolute."""
     data = _load(path)
     tune = data.get("tune")

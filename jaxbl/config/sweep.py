@@ -61,8 +61,9 @@ class SweepTable(Table):
             raise table_error("refine_tolerance needs a numeric refine_metric, e.g. 'motor.velocity_rmse'")
         if self.metrics is not None and not self.metrics:
             raise table_error("metrics should name at least one, e.g. 'converged'; leave it out for all")
-        for name in self.metrics or ():
-            if self.metrics is not None and self.metrics.count(name) > 1:
+        names = self.metrics or []
+        for name in names:
+            if names.count(name) > 1:
                 raise table_error(f"metrics names '{name}' twice; once is enough")
         if self.refine is not None and self.design != "grid":
             raise table_error(f"refine needs design = 'grid'; points of a {self.design} design have no neighbours")

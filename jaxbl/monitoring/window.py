@@ -140,9 +140,9 @@ class Window:
         counts = (np.arange(count) >= self._rows_until_settled).astype(float)
         self._rows_until_settled = max(self._rows_until_settled - count, 0)
         new_rows = rows | {"counts": counts}
-        if not self._rows:
-            self._rows = {name: values[:0] for name, values in new_rows.items()}
-        self._rows = {name: np.concatenate([old, new_rows[name]])[-self.samples :] for name, old in self._rows.items()}
+        self._rows = {
+            name: np.concatenate([self._rows.get(name, new[:0]), new])[-self.samples :] for name, new in new_rows.items()
+        }
 
     def estimate(self) -> dict[str, SideNumbers]:
         """Numbers of each side whose window determines them; none before the window is full."""

@@ -133,20 +133,20 @@ class _ChannelReader:
         # the same as pandas' comparison of a column with a number, true or false
         for column, required in (self._table.where or {}).items():
             values = values[values[:, self._indices[column]] == required]
+        columns = {column: values[:, index] for column, index in self._indices.items()}
         clock = self._table.t or TimeTable()
         if clock.period is not None:
             stamps = (self._row + np.arange(len(values))) * clock.period
             self._row += len(values)
         else:
-            stamps = values[:, self._indices[clock.column_or("t")]] * SECONDS_PER_UNIT[clock.unit]
+            stamps = columns[clock.column_or("t")] * SECONDS_PER_UNIT[clock.unit]
         torque_table = self._table.u or TorqueTable()
-        torque = to_si(torque_table, decode_words(torque_table, values[:, self._indices[torque_table.column_or("u")]]))
-        signals = [stamps, torque]
+        signals = [stamps, to_si(torque_table, decode_words(torque_table, columns[torque_table.column_or("u")]))]
         is_readable = np.abs(stamps) * np.finfo(float).eps < 0.5 * period
         for channel, table in self._positions:
-            numbers = decode_words(table, values[:, self._indices[table.column_or(channel)]])
+            numbers = decode_words(table, columns[table.column_or(channel)])
             if isinstance(table, PositionTable) and table.minus is not None:
-                numbers = numbers - decode_words(table, values[:, self._indices[table.minus]])
+                numbers = numbers - decode_words(table, columns[table.minus])
             elif isinstance(table, PositionTable) and table.wrap is not None:
                 is_readable &= np.abs(numbers) <= 2.0 * table.wrap
             signals.append(numbers)

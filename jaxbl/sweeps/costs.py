@@ -10,7 +10,7 @@ a short run of the study would choose at random where the backends are equally f
 import functools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -70,9 +70,10 @@ class Costs(NamedTuple):
         """The cost of a backend."""
         return getattr(self, backend)
 
-    def compile_seconds(self, backend: Backend, operations: Operations) -> float:
-        """Seconds to compile a program."""
-        return self.of(backend).equation * operations.equations
+    def study_seconds(self, backend: Backend, operations: Operations, layout: Layout, samples: int, programs: int) -> float:
+        """Seconds to compile the programs of a study, and for the samples of all its chunks."""
+        compile_seconds = programs * self.of(backend).equation * operations.equations
+        return compile_seconds + samples * self.sample_seconds(backend, operations, layout)
 
     def sample_seconds(self, backend: Backend, operations: Operations, layout: Layout) -> float:
         """Seconds for a sample of a chunk.
@@ -138,39 +139,9 @@ def lanes_at_once(devices: Sequence[Any], backend: Backend, operations: Operatio
     return _GPU_LANES if devices[0].platform == "gpu" else load_costs(devices).best_lanes(backend, operations, len(devices))
 
 
-class Work(NamedTuple):
-    """The work of a study by a backend.
-
-    Attributes:
-        operations: operations of a sample.
-        layout: shape of a chunk.
-        samples: samples of all chunks.
-    """
-
-    operations: Operations
-    layout: Layout
-    samples: int
-
-
-def choose_backend(devices: Sequence[Any], works: Mapping[Backend, Work], programs: int) -> Backend:
-    """The backend that takes less time in all.
-
-    Args:
-        devices: JAX devices to use.
-        works: what the study takes, by backend.
-        programs: number of programs to compile.
-    """
-    if devices[0].platform not in ("cpu", "gpu") or (devices[0].platform == "gpu" and len(devices) > 1):
-        # the fused loop supports neither
-        return "scan"
-    costs = load_costs(devices)
-
-    def total_seconds(backend: Backend) -> float:
-        operations, layout, samples = works[backend]
-        run_seconds = samples * costs.sample_seconds(backend, operations, layout)
-        return programs * costs.compile_seconds(backend, operations) + run_seconds
-
-    return min(BACKENDS, key=total_seconds)
+def can_run_fused(devices: Sequence[Any]) -> bool:
+    """True if the fused loop supports some devices."""
+    return devices[0].platform == "cpu" or (devices[0].platform == "gpu" and len(devices) == 1)
 
 
 def count_operations(config: Config, paths: Sequence[str], names: MetricNames = None) -> Operations:

@@ -21,7 +21,7 @@ from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
-from .costs import Operations, Work, choose_backend, count_operations, lanes_at_once, load_costs
+from .costs import Operations, can_run_fused, count_operations, lanes_at_once, load_costs
 from .metrics import ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
 from .points import Points
 from .programs import (
@@ -157,14 +157,18 @@ class Engine:
 
     def _choose_backend(self) -> Backend:
         """The faster backend; it must not depend on the chunk size that is set, since backends round differently."""
-        if not self._varied_paths:
-            # the fused loop does not support lanes that differ only in their seed
+        # the fused loop does not support lanes that differ only in their seed
+        if not self._varied_paths or not can_run_fused(self.devices):
             return "scan"
-        works, steps = {}, sum(group.config.run.steps for group in self.points.groups)
-        for backend, operations in self._operations.items():
+        groups, costs = self.points.groups, load_costs(self.devices)
+        steps = sum(group.config.run.steps for group in groups)
+
+        def study_seconds(backend: Backend) -> float:
             layout = self._choose_layout(backend, None)
-            works[backend] = Work(operations, layout, steps * self.count_chunks(self.points.coarse_size, layout))
-        return choose_backend(self.devices, works, len(self.points.groups))
+            samples = steps * self.count_chunks(self.points.coarse_size, layout)
+            return costs.study_seconds(backend, self._operations[backend], layout, samples, len(groups))
+
+        return min(BACKENDS, key=study_seconds)
 
     def _choose_layout(self, backend: Backend, chunk: int | None) -> Layout:
         """Choose the chunk shape for the number of lanes that is set, or else for the number that suits the devices."""
