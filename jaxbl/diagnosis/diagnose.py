@@ -27,7 +27,6 @@ from .choice import Choice, Chosen
 from .confidence import confirm, explained_share
 from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_summary import (
-    contradictions_of,
     describe_observers,
     extended_study,
     rival_tables,
@@ -169,7 +168,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             summary["where"][side]["observed"] = witness
         summary["feedback"] = find_feedback_bias(task.record, setup.fitted.segments, fitted.experiment)
         summary["notes"] += [there["sentence"] for there in summary["feedback"].values()] + notes
-        summary["contradictions"] = contradictions_of(task.record, apart)
+        summary["contradictions"] = apart
         summary["gap"] = proof.gap | summarise_test(judgement, proof)
         if judgement.verdict == "unknown_effect":
             segments = setup.fitted.segments

@@ -5,17 +5,17 @@ missing."""
 # pyright: reportArgumentType=false
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
-from jaxbl.chain import Experiment
+from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.free_parameters import FreeParameter, free_values
+from jaxbl.estimation.log_columns import join_columns
 from jaxbl.estimation.logs import run_of
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
@@ -30,7 +30,6 @@ from .history import Step, describe_history
 from .judgement import Judgement
 from .localise import Localised
 from .neutral_effects import with_added
-from .numbers_by_log import Contradiction
 from .observer_residual import SideObserved, compare_observers
 from .proof import Proof
 from .residuals import SideResiduals
@@ -42,7 +41,7 @@ from .thresholds import LIMITS
 def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step], holdout_z: Numbers) -> JsonObject:
     """Make the summary but for the gap, the verdict, and what the observers say; `holdout_z` as of a proof."""
     task, record, located = setup.task, setup.task.record, setup.located
-    fitted, explanation = chosen.fitted, chosen.explanation
+    fitted = chosen.fitted
     where = where_lacking(record, located)
     values, errors = free_values(fitted.free, fitted.theta), fitted.errors()
     notes = list(record.notes)
@@ -69,10 +68,10 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step], holdout_z:
         # what has the larger torque matters more
         "findings": sorted(
             (
-                describe_finding(record, finding, values, errors, where)
+                describe_finding(record, finding, errors, where)
                 | {
                     "share": fitted.share(finding.effect),
-                    "z": explanation.gains[finding.effect].standard_errors,
+                    "z": chosen.explanation.gains[finding.effect].standard_errors,
                     "holdout_z": holdout_z.get(finding.effect),
                     "in_log": EFFECTS[finding.effect].in_log,
                 }
@@ -83,7 +82,6 @@ def summary_of(setup: Setup, chosen: Chosen, history: Sequence[Step], holdout_z:
         "parameters": describe_parameters(record, setup.free, values, errors),
         "numbers_off": chosen.numbers_off,
         "where": where,
-        "rest": {name: {"evidence": gain, "share": share} for name, (gain, share) in explanation.remainder.items()},
         "history": describe_history(history),
         "notes": notes,
     }
@@ -99,12 +97,12 @@ def describe_parameters(record: Record, free: Sequence[FreeParameter], values: N
     }
 
 
-def describe_finding(record: Record, finding: Finding, values: Numbers, errors: Numbers, where: JsonObject) -> JsonObject:
-    """Describe a finding but for its share and gain; values and standard errors by path, `where` by side."""
+def describe_finding(record: Record, finding: Finding, errors: Numbers, where: JsonObject) -> JsonObject:
+    """Describe a finding but for its share; standard errors by path, `where` by side."""
     units = units_of(EFFECTS[finding.effect])
     numbers = {
         leaf: Quantity(
-            values.get(f"effects.{finding.effect}.{leaf}", value),
+            value,
             errors.get(f"effects.{finding.effect}.{leaf}", 0.0),
             unit=record.unit_of(f"{finding.effect}.{leaf}", units[leaf]),
         ).to_dict()
@@ -135,21 +133,6 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
         },
         "test": judgement.test,
     }
-
-
-def contradictions_of(record: Record, contradictions: Sequence[Contradiction]) -> list[JsonObject]:
-    """Numbers that two logs show to be different, in the log's units."""
-    return [
-        {
-            "parameter": contradiction.path,
-            "unit": record.unit_of(contradiction.path, contradiction.unit),
-            "logs": [
-                {"log": value.log} | Quantity(value.value, value.error).to_dict()
-                for value in (contradiction.least, contradiction.most)
-            ],
-        }
-        for contradiction in contradictions
-    ]
 
 
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> JsonObject:
@@ -228,32 +211,19 @@ def trace_of(
     if setup.nominal.transmission is not None:
         columns["twist"] = setup.nominal.plant.twist(joined.positions)
     columns["held_out"] = np.arange(len(joined.time)) >= len(task.record.time)
-    logs = [(task.record, setup.fitted.segments)] + ([] if task.separate else [(proof.record, proof.log.segments)])
-    parts = [rows for record, _ in logs for rows in record.segments]
-
-    def along(values: Iterable[Any]) -> np.ndarray:
-        column = np.full(len(joined.time), np.nan)
-        for rows, piece in zip(parts, values, strict=True):
-            column[rows] = piece
-        return column
-
-    before, _ = missing["missing_before"]
-    for side in before:
-        for order, name in ((1, "velocity"), (2, "acceleration")):
-            columns[f"{side}.{name}"] = along(
-                segment.smoothed[side].state[:, order] for _, segments in logs for segment in segments
-            )
-        for name, torques in missing.items():
-            pieces = [piece for torque in torques[: len(logs)] for piece in torque[side]]
-            columns[f"{side}.{name}"] = along(piece.torque for piece in pieces)
-            if name == "missing_before":
-                columns[f"{side}.noise"] = along(piece.deviation for piece in pieces)
-    for side in observed[0]:
-        torque, noise = np.full((2, len(joined.time)), np.nan)
-        for record, pieces in zip((task.record, proof.record), observed, strict=True):
-            for part, piece in zip(record.segments if pieces else (), pieces.get(side, ()), strict=True):
-                if piece.has_converged:
-                    rows = slice(part.start + piece.skipped, part.stop)
-                    torque[rows], noise[rows] = piece.residual.torque, piece.residual.deviation
-        columns |= {f"{side}.observed_before": torque, f"{side}.observed_noise": noise}
-    return pd.DataFrame(columns)
+    segments, pieces = [], []
+    for part, log in enumerate([setup.fitted] if task.separate else [setup.fitted, proof.log]):
+        for i, segment in enumerate(log.segments):
+            piece: NamedArrays = {}
+            for side, smoothed in segment.smoothed.items():
+                piece |= {f"{side}.velocity": smoothed.velocity, f"{side}.acceleration": smoothed.acceleration}
+                residuals = {name: torques[part][side][i] for name, torques in missing.items()}
+                piece |= {f"{side}.{name}": residual.torque for name, residual in residuals.items()}
+                piece[f"{side}.noise"] = residuals["missing_before"].deviation
+                late = observed[part][side][i]
+                for name, values in (("before", late.residual.torque), ("noise", late.residual.deviation)):
+                    told = values if late.has_converged else np.full_like(values, np.nan)
+                    piece[f"{side}.observed_{name}"] = np.append(np.full(late.skipped, np.nan), told)
+            segments.append(segment)
+            pieces.append(piece)
+    return pd.DataFrame(columns | join_columns(len(joined.time), segments, pieces))

@@ -220,9 +220,8 @@ def _summary(
             share = min(value * model.number("transmission.stiffness", alone.point.theta) / size, 1.0)
         else:
             share = value / float(drive.ratio(name.partition(".")[0])) / size
-        weight = {"share": share, "z": max(gains[name], 0.0) ** 0.5}
         finding = Finding(name, chance, numbers[name], ())
-        findings.append(describe_finding(record, finding, values, errors, {}) | weight)
+        findings.append(describe_finding(record, finding, errors, {}) | {"share": share})
     notes = list(record.notes)
     notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
     if alone.reason:
@@ -235,7 +234,6 @@ def _summary(
         "findings": findings,
         "parameters": describe_parameters(record, search.free, values, errors),
         "where": {"motor": {"sentence": sentence}},
-        "rest": {},
         "contradictions": [],
         "notes": notes,
         # of the squared error beyond noise; where the model as given leaves no more than a complete one, nothing is missing

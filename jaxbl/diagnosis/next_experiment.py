@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float
-from scipy.signal import max_len_seq
 
 from jaxbl.chain import Experiment, plant_trajectory
 from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import Backlash
+from jaxbl.drive.excitation import AbstractExcitation, Chirp, Multisine, Prbs, Sine
 from jaxbl.drive.plant import PlantState
 from jaxbl.errors import InputError
 from jaxbl.estimation.logs import LogTask, default_paths, on_record
@@ -30,13 +30,12 @@ from jaxbl.records import Record
 from .diagnosis_summary import find_tie
 from .neutral_effects import with_added
 
-_KINDS = "sine", "multisine", "chirp", "steps"
 _SHARES = 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0
 """Amplitudes, over the largest torque allowed."""
 _FREQUENCIES = 6
 """Tried of each kind, evenly spaced in their logarithm."""
-_HARMONICS = 8
-"""Of a multisine, with Schroeder's phases (IEEE Trans. Information Theory 16, 1970)."""
+_DECADE, _BITS = 10.0, 7
+"""Last frequency of a chirp over its first; bits of the register that makes the steps."""
 _LONGEST = 10.0
 """Duration at most, s."""
 _DECISIVE = 10.0
@@ -238,26 +237,18 @@ def _inputs(record: Record, largest: float, mean: float) -> list[Input]:
     top = min(0.02 / period, 10.0)
     inputs = []
     for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES).tolist():
-        for kind in _KINDS:
-            wave = _wave(kind, time, frequency)
+        waves: dict[str, AbstractExcitation] = {
+            "sine": Sine(1.0, frequency),
+            "multisine": Multisine(1.0, frequency),
+            "chirp": Chirp(1.0, frequency, _DECADE * frequency, time[-1]),
+            "steps": Prbs(1.0, 0.5 / frequency, _BITS),
+        }
+        for kind, excitation in waves.items():
+            wave = np.asarray(jax.vmap(excitation)(time))
             wave = wave / np.max(np.abs(wave))
             amplitudes = [share * largest for share in _SHARES]
             inputs += [Input(kind, most, frequency, mean + most * wave, 0.0, mean) for most in amplitudes]
     return inputs
-
-
-def _wave(kind: str, time: np.ndarray, frequency: float) -> np.ndarray:
-    if kind == "sine":
-        return np.sin(2.0 * np.pi * frequency * time)
-    if kind == "multisine":
-        k = np.arange(1, _HARMONICS + 1)
-        phases = -np.pi * k * (k - 1.0) / _HARMONICS
-        return np.sum(np.cos(2.0 * np.pi * frequency * k[:, None] * time[None, :] + phases[:, None]), axis=0)
-    if kind == "chirp":
-        # over a decade
-        return np.sin(2.0 * np.pi * frequency * (1.0 + 4.5 * time / time[-1]) * time)
-    bits, _ = max_len_seq(7)
-    return 2.0 * bits[np.floor(2.0 * frequency * time + 1e-9).astype(int) % len(bits)] - 1.0
 
 
 @jit

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.estimation.logs import arrays
+from jaxbl.json_types import JsonObject
 from jaxbl.records.least_squares import BlockRegression, rms
 
 from .diagnosis_task import DiagnosisTask
@@ -34,30 +35,9 @@ _INFLATED = 100.0
 """Variance of a number over what it were if all others were known, from which on it depends on them."""
 
 
-class OfLog(NamedTuple):
-    """A number as one log shows it, and its standard error; both in the number's unit."""
-
-    log: str
-    value: float
-    error: float
-
-
-class Contradiction(NamedTuple):
-    """A number that two logs show to be different.
-
-    Attributes:
-        path, unit: of the number.
-        least, most: what the two logs say that are furthest apart for their errors.
-    """
-
-    path: str
-    unit: str
-    least: OfLog
-    most: OfLog
-
-
-def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, driving: float) -> list[Contradiction]:
-    """Numbers of a model that its logs surely do not agree on; none of a single log.
+def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, driving: float) -> list[JsonObject]:
+    """Numbers of a model that its logs surely do not agree on, as in `diagnosis.json`: what the two logs say that are
+    furthest apart for their errors, the smaller number first; none of a single log.
 
     Args:
         task: names the logs.
@@ -74,18 +54,24 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
     contradicting = []
     for k, number in enumerate(fitted.free):
         apart = {
-            (first, other): z
+            (first, other): _apart(by_log[first], by_log[other], k, _LEAST * driving)
             for first, other in itertools.combinations(range(len(by_log)), 2)
-            if (z := _apart(by_log[first], by_log[other], k, _LEAST * driving)) > LIMITS.contradicting
         }
-        if not apart:
+        pair = max(apart, key=apart.__getitem__)
+        if not apart[pair] > LIMITS.contradicting:
             continue
         value, slope = (float(of(fitted.theta[k])) for of in (number.value, number.slope))
-        pair = [
-            OfLog(names[i], value + slope * float(by_log[i].change[k]), abs(slope) * float(by_log[i].error[k]))
-            for i in max(apart, key=lambda pair: apart[pair])
+        logs = [
+            {
+                "log": names[i],
+                "value": value + slope * float(by_log[i].change[k]),
+                "standard_error": abs(slope) * float(by_log[i].error[k]),
+            }
+            for i in pair
         ]
-        contradicting.append(Contradiction(number.path, number.unit, *sorted(pair, key=lambda of: of.value)))
+        unit = task.record.unit_of(number.path, number.unit)
+        logs.sort(key=lambda of_log: of_log["value"])
+        contradicting.append({"parameter": number.path, "unit": unit, "logs": logs})
     return contradicting
 
 

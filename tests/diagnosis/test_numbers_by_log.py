@@ -68,7 +68,7 @@ def compare_logs(
     rows = [slice(0, SAMPLES), slice(SAMPLES, 2 * SAMPLES)]
     names = list(zip(map(Path, files), rows, strict=True))
     segments = tuple(SimpleNamespace(rows=row) for row in rows)
-    task = SimpleNamespace(record=SimpleNamespace(logs=names))
+    task = SimpleNamespace(record=SimpleNamespace(logs=names, unit_of=lambda path, unit: unit))
     config, _ = read_model({"drive": {"kind": "rigid", "motor_inertia": INERTIA, "motor_viscous": VISCOUS}})
     with jax.enable_x64(True):
         experiment = prepare(config.with_keys("run", precision="float64"))
@@ -80,17 +80,15 @@ def compare_logs(
 
 def test_an_inertia_that_two_logs_show_to_differ():
     (contradiction,) = compare_logs(INERTIA, 1.5 * INERTIA)
-    assert contradiction.path == "drive.motor_inertia" and (contradiction.least.log, contradiction.most.log) == (
-        "a.csv",
-        "b.csv",
-    )
-    assert contradiction.least.value == pytest.approx(INERTIA, abs=4.0 * contradiction.least.error)
-    assert contradiction.most.value == pytest.approx(1.5 * INERTIA, rel=0.01)
+    least, most = contradiction["logs"]
+    assert contradiction["parameter"] == "drive.motor_inertia" and (least["log"], most["log"]) == ("a.csv", "b.csv")
+    assert least["value"] == pytest.approx(INERTIA, abs=4.0 * least["standard_error"])
+    assert most["value"] == pytest.approx(1.5 * INERTIA, rel=0.01)
 
 
 def test_logs_of_one_name_are_two():
     (contradiction,) = compare_logs(INERTIA, 1.5 * INERTIA, files=("data/run1/log.csv", "data/run2/log.csv"))
-    assert (contradiction.least.log, contradiction.most.log) == ("run1/log.csv", "run2/log.csv")
+    assert [of_log["log"] for of_log in contradiction["logs"]] == ["run1/log.csv", "run2/log.csv"]
 
 
 def test_logs_of_one_machine_agree():
@@ -100,7 +98,7 @@ def test_logs_of_one_machine_agree():
 def test_a_friction_that_the_model_lacks_is_no_contradiction():
     """Dry friction of one machine would be a viscous friction, a larger one where the drive moves less."""
     (contradiction,) = compare_logs(INERTIA, INERTIA, friction=5e-3, is_beside=False)
-    assert contradiction.path == "drive.motor_viscous"
+    assert contradiction["parameter"] == "drive.motor_viscous"
     assert compare_logs(INERTIA, INERTIA, friction=5e-3) == []
     # another inertia shows beside it
     assert compare_logs(INERTIA, 1.5 * INERTIA, friction=5e-3) != []
