@@ -27,10 +27,10 @@ from .choice import Choice, Chosen
 from .confidence import confirm, explained_share
 from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_summary import (
+    describe_gap,
     describe_observers,
     extended_study,
     rival_tables,
-    summarise_test,
     summary_of,
     trace_of,
     where_lacking,
@@ -169,7 +169,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         summary["feedback"] = find_feedback_bias(task.record, setup.fitted.segments, fitted.experiment)
         summary["notes"] += [there["sentence"] for there in summary["feedback"].values()] + notes
         summary["contradictions"] = apart
-        summary["gap"] = proof.gap | summarise_test(judgement, proof)
+        summary["gap"] = describe_gap(setup, proof, judgement)
         if judgement.verdict == "unknown_effect":
             segments = setup.fitted.segments
             coordinates = all_coordinates(fitted.experiment, segments, lacking_after, setup.sliding)

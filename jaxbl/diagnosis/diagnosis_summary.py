@@ -32,6 +32,7 @@ from .localise import Localised
 from .neutral_effects import with_added
 from .observer_residual import SideObserved, compare_observers
 from .proof import Proof
+from .reference_log import Errors, ReferenceLog
 from .residuals import SideResiduals
 from .sentences import sentence_of
 from .setup import Setup
@@ -120,11 +121,27 @@ def describe_finding(record: Record, finding: Finding, errors: Numbers, where: J
     }
 
 
-def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
-    """Say what the held-out errors of a complete model would be, and which of them are larger."""
-    expected = proof.expected
-    before, after = (proof.log.with_slow(comparison) for comparison in (proof.before, proof.after))
+def describe_gap(setup: Setup, proof: Proof, judgement: Judgement) -> JsonObject:
+    """Describe the errors on what was held out, before and after, their noise, what those of a complete model would be, and
+    which are larger."""
+    log, expected, noise = proof.log, proof.expected, proof.log.noise_of(proof.after)
+    before, after = (log.with_slow(comparison) for comparison in (proof.before, proof.after))
+    reach, there = _reach(setup.fitted), _reach(log)
     return {
+        "holdout": {
+            "file": str(proof.record.path.resolve()),
+            "separate": setup.task.separate,
+            "from": log.segments[0].time[0],
+            "to": log.segments[-1].time[-1],
+            "window": log.samples * log.period,
+            "bandwidth": dict(log.bandwidth),
+        },
+        "units": {name: _unit(proof.record, name) for name in proof.after.errors},
+        "driving": {"motor": proof.driving},
+        "holdout_rmse_before": proof.before.errors,
+        "holdout_rmse_after": proof.after.errors,
+        "noise_floor": {name: noise[name] for name in proof.after.errors},
+        "range": {name: {"log": reach[name], "proof": there[name]} for name in reach},
         "expected": {name: error._asdict() for name, error in expected.items() if " below " not in name},
         "slow_torques": {
             name: {"before": before[name], "after": after[name]} | error._asdict()
@@ -133,6 +150,24 @@ def summarise_test(judgement: Judgement, proof: Proof) -> JsonObject:
         },
         "test": judgement.test,
     }
+
+
+def _reach(log: ReferenceLog) -> Errors:
+    """Measure how far a log reaches: travel and largest speed of each side, and largest torque of the input."""
+    reach = {name: np.ptp(values) for name, values in log.readings().items()}
+    for side in log.noise:
+        speeds = np.concatenate([segment.smoothed[side].velocity for segment in log.segments])
+        reach[f"velocity_{side}"] = float(np.max(np.abs(speeds)))
+    torques = np.concatenate([segment.torque for segment in log.segments])
+    return reach | {"torque_motor": float(np.max(np.abs(torques)))}
+
+
+_UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}
+
+
+def _unit(record: Record, name: str) -> str:
+    side = "load" if name.endswith(("_s", "_load")) else "motor"
+    return record.unit_of(f"{side}.position", _UNITS[name.split("_")[0]])
 
 
 def where_lacking(record: Record, located: Mapping[str, Localised]) -> JsonObject:

@@ -11,6 +11,7 @@ from jaxbl.estimation.segments import skip_unknown_input
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 from jaxbl.records.plausibility import GEAR_TOLERANCE
+from jaxbl.records.signal_quality import segments_before
 
 HELD_OUT = 0.25
 """Share of a log that is held out where there is no other one for it."""
@@ -91,7 +92,7 @@ def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
             f"{int(np.ceil(_LEAST_SAMPLES / HELD_OUT))} are needed, or another log: --holdout"
         )
     row = int(rows[round((1.0 - HELD_OUT) * len(rows)) - 1]) + 1
-    first = tuple(slice(part.start, min(part.stop, row)) for part in record.segments if part.start < row)
+    first = tuple(segments_before(record.segments, row))
     last = tuple(slice(max(part.start, row), part.stop) for part in record.segments if part.stop > row)
     cut = {
         name: None if (values := getattr(record, name)) is None else values[:row]

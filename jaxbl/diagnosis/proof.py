@@ -49,7 +49,7 @@ class Proof(NamedTuple):
         untested: effects without which the model would pass as well: their torque there, and on the log that was fitted
             (`on_log`), N m, rms at the motor.
         holdout_z: standard errors by which each effect that acts there makes the model predict better.
-        gap: errors before and after, and noise, as in `diagnosis.json`.
+        driving: torque that drives the machine there, rms, N m.
     """
 
     record: Record
@@ -62,7 +62,7 @@ class Proof(NamedTuple):
     weak: list[str]
     untested: JsonObject
     holdout_z: dict[str, float]
-    gap: JsonObject
+    driving: float
 
     @property
     def has_power(self) -> bool:
@@ -116,19 +116,8 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         # what tests nothing contradicts nothing
         [name for name in list_failed(log.with_slow(after), expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
-        weak, untested, holdout_z,
-        _describe_gap(setup, record, log, before, after, sizes["torque_motor"]),
+        weak, untested, holdout_z, sizes["torque_motor"],
     )  # fmt: skip
-
-
-def _reach(log: ReferenceLog) -> Errors:
-    """Measure how far a log reaches: travel and largest speed of each side, and largest torque of the input."""
-    reach = {name: np.ptp(values) for name, values in log.readings().items()}
-    for side in log.noise:
-        speeds = np.concatenate([segment.smoothed[side].velocity for segment in log.segments])
-        reach[f"velocity_{side}"] = float(np.max(np.abs(speeds)))
-    torques = np.concatenate([segment.torque for segment in log.segments])
-    return reach | {"torque_motor": float(np.max(np.abs(torques)))}
 
 
 def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
@@ -162,35 +151,3 @@ def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> 
     return float(
         np.hypot.reduce([rms(pair[0][side] - pair[1][side]) / float(model.drive.ratio(side)) for side in model.sides])
     )
-
-
-def _describe_gap(
-    setup: Setup, record: Record, log: ReferenceLog, before: Comparison, after: Comparison, driving: float
-) -> JsonObject:
-    """Errors before and after, the noise, and the torque that is `driving`."""
-    noise = log.noise_of(after)
-    reach, there = _reach(setup.fitted), _reach(log)
-    return {
-        "holdout": {
-            "file": str(record.path.resolve()),
-            "separate": setup.task.separate,
-            "from": float(record.time[log.segments[0].rows.start]),
-            "to": float(record.time[log.segments[-1].rows.stop - 1]),
-            "window": log.samples * log.period,
-            "bandwidth": dict(log.bandwidth),
-        },
-        "units": {name: _unit(record, name) for name in after.errors},
-        "driving": {"motor": driving},
-        "holdout_rmse_before": before.errors,
-        "holdout_rmse_after": after.errors,
-        "noise_floor": {name: noise[name] for name in after.errors},
-        "range": {name: {"log": reach[name], "proof": there[name]} for name in reach},
-    }
-
-
-_UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}
-
-
-def _unit(record: Record, name: str) -> str:
-    side = "load" if name in ("theta_s", "velocity_load", "torque_load") else "motor"
-    return record.unit_of(f"{side}.position", _UNITS[name.split("_")[0]])

@@ -5,7 +5,7 @@ is foretold. Torques by the equations of motion at the smoothed motion, behind o
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from jaxbl.records.signal_quality import estimate_white_noise
 
 from .free_starts import Run, best_runs, count_seen
 from .neutral_effects import lean, with_torques
-from .residuals import SideResiduals, as_smoothed, low_passed, narrow, residual_torques
+from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrow, residual_torques
 
 BLOCKS = 16
 """Of a log, over which errors are compared: enough for a standard error, and longer than errors are correlated in most
@@ -100,9 +100,11 @@ class ReferenceLog:
     def noise_floor(self, torques: SideResiduals) -> Errors:
         """Noise of each channel: what a perfect model would leave."""
         floor = {POSITION_CHANNELS[side]: noise for side, noise in self.noise.items()}
-        for side in self.noise:
-            floor[f"velocity_{side}"] = _rms([segment.smoothed[side].deviation(1) for segment in self.segments])
-        return floor | {name: _rms([noise]) for name, noise in self._narrow_torques(torques, "deviation").items()}
+        deviations = {
+            f"velocity_{side}": np.concatenate([segment.smoothed[side].deviation(1) for segment in self.segments])
+            for side in self.noise
+        }
+        return floor | _all_rms(deviations | self._narrow_torques(torques, "deviation"))
 
     def noise_of(self, compared: Comparison) -> Errors:
         """Noise of each channel, slow torques among them: what the smoother finds or, where that is more, the white part of
@@ -130,16 +132,12 @@ class ReferenceLog:
         for side, pieces in torques.items():
             for cutoff in (self.bandwidth[side] / factor for factor in _SLOW):
                 if 2.0 * cutoff * sum(len(piece.time) * piece.period for piece in pieces) >= _LEAST_VALUES:
-                    values = [getattr(narrow(piece, cutoff)[0], name) for piece in pieces]
-                    slow_torques[f"torque_{side} below {cutoff:.3g} Hz"] = np.concatenate(values)
+                    slow_torques[f"torque_{side} below {cutoff:.3g} Hz"] = _join_narrow(pieces, cutoff, name)
         return slow_torques
 
     def _narrow_torques(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
         """Missing torques, or their noise, behind the low-pass, N m."""
-        return {
-            f"torque_{side}": np.concatenate([getattr(narrow(piece, self.bandwidth[side])[0], name) for piece in pieces])
-            for side, pieces in torques.items()
-        }
+        return {f"torque_{side}": _join_narrow(pieces, self.bandwidth[side], name) for side, pieces in torques.items()}
 
     def largest_departures(self, experiment: Experiment) -> Errors:
         """Measure how far a model departs from each side's motion on short windows from the smoothed states, over its range.
@@ -214,20 +212,18 @@ class ReferenceLog:
                 side: smooth(values, self.period, noise_and_jerk=(segment.smoothed[side].noise, segment.smoothed[side].jerk))
                 for side, values in readings.items()
             }
-            rows = slice(int(first), int(first) + self.samples)
-            inside = slice(rows.start - segment.rows.start, rows.stop - segment.rows.start)
+            start = int(first) - segment.rows.start
             earlier = segment.torque[:1] if segment.before is None else segment.before
-            before = np.concatenate([np.repeat(earlier[:1], _BEFORE), earlier, segment.torque[: inside.start]])[-_BEFORE:]
-            pieces.append(
-                Segment(rows, segment.time[inside], self.period, segment.torque[inside], readings, smoothed, before=before)
-            )
+            before = np.concatenate([np.repeat(earlier[:1], _BEFORE), earlier, segment.torque[:start]])[-_BEFORE:]
+            window = segment[start : start + self.samples]
+            pieces.append(replace(window, readings=readings, smoothed=smoothed, before=before))
         torques = residual_torques(experiment, pieces)
         return _all_rms(self._narrow_torques(torques) | self.slow(torques))
 
     def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""
-        torques = self._narrow_torques(self.find_lacking(experiment), name)
-        return {side: torques[f"torque_{side}"] for side in experiment.sides}
+        torques = self.find_lacking(experiment)
+        return {side: _join_narrow(pieces, self.bandwidth[side], name) for side, pieces in torques.items()}
 
     def lacking_friction(self, experiment: Experiment, side: str) -> tuple[np.ndarray, np.ndarray]:
         """A dry friction and a steady torque of 1 N m on a side, behind the low-pass as in :meth:`missing`, shape
@@ -281,10 +277,10 @@ def _rows_of(count: int, part: _Part) -> np.ndarray:
     return np.flatnonzero(parts_of_blocks(part[1])[BLOCKS * np.arange(count) // count] == part[0])
 
 
+def _join_narrow(pieces: Sequence[Residual], cutoff: float, name: str) -> np.ndarray:
+    """Missing torques, or their noise, behind a low-pass (Hz), one piece after the other, N m."""
+    return np.concatenate([getattr(narrow(piece, cutoff)[0], name) for piece in pieces])
+
+
 def _all_rms(samples: NamedArrays) -> Errors:
-    return {name: _rms([errors]) for name, errors in samples.items()}
-
-
-def _rms(pieces: Sequence[np.ndarray]) -> float:
-    values = np.concatenate([np.ravel(piece) for piece in pieces])
-    return rms(values) if np.isfinite(values).all() else float("inf")
+    return {name: rms(errors) if np.isfinite(errors).all() else np.inf for name, errors in samples.items()}

@@ -119,14 +119,6 @@ def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.nda
     return accelerations.T.reshape(values.shape)
 
 
-def _torques(experiment: Experiment, position: dict, velocity: dict, *motion: Any) -> tuple[dict[str, Array], ...]:
-    """All modelled torques on each side but for set-valued friction, and the level of that, N m; arguments as of
-    :meth:`jaxbl.drive.plant.Plant.side_torques`."""
-    acting, drive = experiment.plant.side_torques(position, velocity, *motion), experiment.drive
-    total = {side: total_of - drive.viscous(side) * velocity[side] for side, (total_of, _) in acting.items()}
-    return total, {side: jnp.asarray(level, velocity[side].dtype) for side, (_, level) in acting.items()}
-
-
 def _dry(
     experiment: Experiment,
     side: str,
@@ -181,8 +173,13 @@ def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Ar
     drive, equations = experiment.drive, {}
 
     def of(position: dict, velocity: dict, *motion: Any) -> tuple[Any, Any]:
-        total, level = torques = _torques(experiment, position, velocity, *motion)
-        return {side: total[side] - level[side] * jnp.sign(velocity[side]) for side in total}, torques
+        """All modelled torques on each side; and apart from one another those without set-valued friction, and its level."""
+        torques, total, levels = {}, {}, {}
+        for side, (acting, level) in experiment.plant.side_torques(position, velocity, *motion).items():
+            levels[side] = jnp.asarray(level, velocity[side].dtype)
+            total[side] = acting - drive.viscous(side) * velocity[side]
+            torques[side] = total[side] - levels[side] * jnp.sign(velocity[side])
+        return torques, (total, levels)
 
     slopes, (totals, levels) = jax.vmap(jax.jacfwd(of, argnums=(0, 1), has_aux=True))(
         part.position, part.velocity, states, torque, part.time, part.transmitted
