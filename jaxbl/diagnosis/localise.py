@@ -221,8 +221,7 @@ def locate(
         values = [values_of[name].values[rows] for values_of, rows in zip(coordinates, rows_of, strict=True)]
         over[name] = _over_coordinate(name, coordinates[0][name]._replace(values=np.concatenate(values)), joined, excess)
     longest = int(np.argmax([len(residual.time) for residual in residuals]))
-    motion = coordinates[longest]["speed"].values if "speed" in names else None
-    peaks = _find_peaks(residuals[longest], motion, float(np.sqrt(excess / joined.count)))
+    peaks = _find_peaks(residuals[longest], coordinates[longest]["speed"].values, float(np.sqrt(excess / joined.count)))
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
     beyond = (
         (z > LIMITS.significant and missing > floor)
@@ -313,11 +312,9 @@ def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, ex
     if joined.z < LIMITS.significant:
         # nothing to be shared out
         return 0.0
-    best = 0.0
-    counts = [1] if values_of.classes else [n for n in _COUNTS if n <= max(joined.effective / _IN_A_BIN, 2.0)]
-    if name == "time":
-        counts = [n for n in counts if n * _FOLDS <= max(joined.effective / _IN_A_BIN, 2 * _FOLDS)]
-    for count in counts:
+    best, least = 0.0, _FOLDS if name == "time" else 1
+    counts = [n for n in _COUNTS if n * least <= max(joined.effective / _IN_A_BIN, 2 * least)]
+    for count in [1] if values_of.classes else counts:
         _, index, bins = _bin_samples(name, values_of, np.linspace(0.0, 1.0, count + 1))
         fold = _folds(joined, name, bins)
         sums, numbers = _sums(joined.torque, fold, _FOLDS, index, bins)
@@ -328,7 +325,7 @@ def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, ex
     return min(best / excess, 1.0)
 
 
-def _find_peaks(residual: Residual, speed: np.ndarray | None, missing: float) -> tuple[SpectralPeak, ...]:
+def _find_peaks(residual: Residual, speed: np.ndarray, missing: float) -> tuple[SpectralPeak, ...]:
     """Find narrow peaks in the spectrum of a part; shares are of the square of the torque that is `missing`, N m."""
     frequency, power = _spectrum(residual.torque, residual.period)
     audible = frequency <= 2.0 * residual.bandwidth
@@ -336,7 +333,7 @@ def _find_peaks(residual: Residual, speed: np.ndarray | None, missing: float) ->
     density = residual.density_at(2.0 * np.pi * frequency * residual.period) / mean_density(residual.density)
     floor = np.mean(residual.deviation**2) * density * 2.0 / len(residual.time)
     floor = np.maximum(floor, 1e-12 * np.max(floor))
-    motion = np.zeros(len(power)) if speed is None else _spectrum(speed, residual.period)[1][audible]
+    motion = _spectrum(speed, residual.period)[1][audible]
     # a line of noise is exponential: so many times its mean is the largest of all
     z = np.sqrt(np.maximum(2.0 * (power / (1.1 * floor) - np.log(len(power))), 0.0))
     stands_out = (z > LIMITS.significant) & (power > _NARROW * median_filter(power, _AROUND))
@@ -347,7 +344,7 @@ def _find_peaks(residual: Residual, speed: np.ndarray | None, missing: float) ->
         near = slice(max(peak - 2, 0), peak + 3)
         here = float(np.sum(np.maximum(power - floor, 0.0)[near]))
         share = here / max(missing**2, here)
-        moved = bool(np.sum(motion[near]) > _MOVED * share * np.sum(motion)) if motion.any() else False
+        moved = bool(np.sum(motion[near]) > _MOVED * share * np.sum(motion))
         loudest.append(SpectralPeak(float(frequency[peak]), float(np.sqrt(2.0 * here)), share, float(z[peak]), moved))
     return tuple(loudest)
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from jaxbl.lines import percent
+
 from .coordinates import EVERYWHERE
 from .localise import Coordinate, Localised
 from .thresholds import LIMITS
@@ -38,11 +40,9 @@ def sentence_of(located: Localised, unit: str = "N m") -> str:
     if not located.significant:
         return f"{side}: nothing beyond noise ({located.noise:.2g} {unit} rms up to {located.bandwidth:.3g} Hz)"
     size = f"{located.missing:.2g} {unit} rms"
-    best = max((coordinate.explained for coordinate in located.coordinates.values()), default=0.0)
-    telling = next(
-        (coordinate for coordinate in located.coordinates.values() if coordinate.explained >= best - _SIMPLER), None
-    )
-    place = "" if telling is None else _PLACE.get(telling.name, f"a function of {telling.name}")
+    best = max(coordinate.explained for coordinate in located.coordinates.values())
+    telling = next(coordinate for coordinate in located.coordinates.values() if coordinate.explained >= best - _SIMPLER)
+    place = _PLACE[telling.name]
     crowd = _find_crowded(located)
     clauses = []
     if crowd is not None and (best < _TELLING or crowd[0] > _TELLING):
@@ -50,15 +50,15 @@ def sentence_of(located: Localised, unit: str = "N m") -> str:
     lines = [peak for peak in located.peaks if not peak.in_motion]
     if lines and lines[0].power_share > max(best, _TELLING) - _SIMPLER:
         clauses.append(
-            f"at {lines[0].frequency:.4g} Hz; {_percent(lines[0].power_share)} of the residual power is a narrow peak there"
+            f"at {lines[0].frequency:.4g} Hz; {percent(lines[0].power_share)} of the residual power is a narrow peak there"
         )
-    elif telling is not None and best >= _TELLING:
+    elif best >= _TELLING:
         values = _class_means(telling, unit)
-        clauses.append(f"{place}{values}; {_percent(telling.explained)} of the residual power goes with it")
+        clauses.append(f"{place}{values}; {percent(telling.explained)} of the residual power goes with it")
     if not clauses and located.excess_z < LIMITS.significant:
         return f"{side}, {_faint(located, unit)}"
     if not clauses:
-        hint = f" (most: {_percent(best)}, {place})" if best > _HINT else ""
+        hint = f" (most: {percent(best)}, {place})" if best > _HINT else ""
         clauses.append(f"spread over the log: no function of speed, position, load or time alone explains half of it{hint}")
     return f"{side}, {'; '.join(clauses)} ({size})"
 
@@ -71,17 +71,10 @@ def _faint(located: Localised, unit: str) -> str:
     if located.peaks and located.peaks[0].excess_z > z:
         peak = located.peaks[0]
         return f"faint: a narrow peak of {peak.amplitude:.2g} {unit} at {peak.frequency:.4g} Hz"
-    place = (
-        region.label
-        or f"where {region.low:.3g} < {coordinate.symbol or coordinate.name} < {region.high:.3g} {coordinate.unit}".rstrip()
-    )
+    place = region.label or f"where {region.low:.3g} < {coordinate.symbol} < {region.high:.3g} {coordinate.unit}"
     if abs(region.mean_z) >= region.excess_z:
         return f"faint: {region.mean:+.2g} ± {region.mean_error:.1g} {unit} on average {place}"
     return f"faint: {np.sqrt(max(region.excess, 0.0)):.2g} {unit} rms beyond noise {place}"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * min(share, 1.0):.0f} %"
 
 
 def _class_means(coordinate: Coordinate, unit: str) -> str:
@@ -99,8 +92,7 @@ def _find_crowded(located: Localised) -> tuple[float, str] | None:
         keys = "power_share", "time_share", "excess_z"
         power, time, z = (np.array([getattr(r, key) for r in coordinate.regions]) for key in keys)
         if coordinate.name == "reversals":
-            near = np.array([r.label.startswith("reversals") for r in coordinate.regions])
-            groups = [near] if near.any() else []
+            groups = [np.array([r.label.startswith("reversals") for r in coordinate.regions])]
         elif any(r.label for r in coordinate.regions):
             groups = list(np.eye(len(power), dtype=bool))
         else:
@@ -113,24 +105,22 @@ def _find_crowded(located: Localised) -> tuple[float, str] | None:
                 continue
             # of regions that hold as much, the simpler coordinate's
             if best is None or score > best[0] + _SIMPLER:
-                best = score, f"{_region_text(coordinate, rows)}"
+                best = score, _region_text(coordinate, rows)
     return best
 
 
 def _region_text(coordinate: Coordinate, rows: np.ndarray) -> str:
     chosen = [region for region, taken in zip(coordinate.regions, rows, strict=True) if taken]
-    share = _percent(sum(region.power_share for region in chosen))
+    share = percent(min(sum(region.power_share for region in chosen), 1.0))
     if chosen[0].label:
         if coordinate.name == "reversals":
             return f"at speed reversals; {share} of the residual power lies near them"
         return f"{chosen[0].label}; {share} of the residual power lies there"
-    low, high = chosen[0].low, chosen[-1].high
-    unit = f" {coordinate.unit}" if coordinate.unit else ""
-    symbol = coordinate.symbol or coordinate.name
+    low, high, symbol, unit = chosen[0].low, chosen[-1].high, coordinate.symbol, coordinate.unit
     if coordinate.name == "|speed|" and rows[0]:
-        return f"at low speed; {share} of the residual power lies where {symbol} < {high:.2g}{unit}"
+        return f"at low speed; {share} of the residual power lies where {symbol} < {high:.2g} {unit}"
     if coordinate.name == "|speed|" and rows[-1]:
-        return f"at high speed; {share} of the residual power lies where {symbol} > {low:.2g}{unit}"
+        return f"at high speed; {share} of the residual power lies where {symbol} > {low:.2g} {unit}"
     if coordinate.name == "time":
         return f"for a while; {share} of the residual power lies between {low:.4g} and {high:.4g} s"
-    return f"at a place; {share} of the residual power lies where {low:.3g} < {symbol} < {high:.3g}{unit}"
+    return f"at a place; {share} of the residual power lies where {low:.3g} < {symbol} < {high:.3g} {unit}"

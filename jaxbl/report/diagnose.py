@@ -382,7 +382,7 @@ def draw_residual(
         values = np.concatenate([part[name].values[row] for part, row in zip(coordinates, rows, strict=True)])
         band = Span(-2.0 * noise, 2.0 * noise, "± 2 noise", MISSING, "y", 0.6)
         dots = cloud(values, torque, colour=SIDE_COLOURS[located.name])
-        x = Axis(with_unit(f"{name} {coordinate.symbol}".rstrip(), coordinate.unit))
+        x = Axis(with_unit(f"{name} {coordinate.symbol}", coordinate.unit))
         panels.append(Panel(x, y, [band, dots, *_means(coordinate)], f"explains {100.0 * coordinate.explained:.0f} %"))
     sentence = sentence_of(located, unit)
     caption = (
