@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxbl.records.least_squares import as_normal, rms
 
-from .reference_log import BLOCKS, Comparison, ReferenceLog
+from .reference_log import BELOW, BLOCKS, Comparison, ReferenceLog
 from .thresholds import LIMITS
 
 QUARTERS = 4
@@ -25,7 +25,9 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
     pair = (control, model)
     # of fewer samples than blocks nothing can be said
     channels = [
-        name for name, errors in control.samples.items() if not name.startswith("velocity") and errors.size >= BLOCKS
+        name
+        for name, errors in control.samples.items()
+        if not name.startswith("velocity") and BELOW not in name and errors.size >= BLOCKS
     ]
     scales = [{name: comparison.gain if name.startswith("torque") else 1.0 for name in channels} for comparison in pair]
     floors = [log.noise_floor(comparison.torques) for comparison in pair]

@@ -139,7 +139,7 @@ class Choice:
         if self._missing is None or self._missing[0] is not fitted:
             driving, compared = self.search.fits.given.drive, self.log.compare(fitted.experiment)
             expected = expected_errors(self.log, fitted, compared, self.setup.input_noise, driving)
-            failed = list_failed(self.log.with_slow(compared), expected)
+            failed = list_failed(compared.errors, expected)
             torque = missing_power(fitted.experiment, compared.errors, expected) ** 0.5 if failed else 0.0
             self._missing = fitted, torque / driving, failed
         return self._missing[1:]

@@ -32,7 +32,7 @@ from .localise import Localised
 from .neutral_effects import with_added
 from .observer_residual import SideObserved, compare_observers
 from .proof import Proof
-from .reference_log import Errors, ReferenceLog
+from .reference_log import BELOW, Errors, ReferenceLog
 from .residuals import SideResiduals
 from .sentences import sentence_of
 from .setup import Setup
@@ -125,7 +125,8 @@ def describe_gap(setup: Setup, proof: Proof, judgement: Judgement) -> JsonObject
     """Describe the errors on what was held out, before and after, their noise, what those of a complete model would be, and
     which are larger."""
     log, expected, noise = proof.log, proof.expected, proof.log.noise_of(proof.after)
-    before, after = (log.with_slow(comparison) for comparison in (proof.before, proof.after))
+    before, after = proof.before.errors, proof.after.errors
+    names = [name for name in after if BELOW not in name]
     reach, there = _reach(setup.fitted), _reach(log)
     return {
         "holdout": {
@@ -136,17 +137,17 @@ def describe_gap(setup: Setup, proof: Proof, judgement: Judgement) -> JsonObject
             "window": log.samples * log.period,
             "bandwidth": dict(log.bandwidth),
         },
-        "units": {name: _unit(proof.record, name) for name in proof.after.errors},
+        "units": {name: _unit(proof.record, name) for name in names},
         "driving": {"motor": proof.driving},
-        "holdout_rmse_before": proof.before.errors,
-        "holdout_rmse_after": proof.after.errors,
-        "noise_floor": {name: noise[name] for name in proof.after.errors},
+        "holdout_rmse_before": {name: before[name] for name in names},
+        "holdout_rmse_after": {name: after[name] for name in names},
+        "noise_floor": {name: noise[name] for name in names},
         "range": {name: {"log": reach[name], "proof": there[name]} for name in reach},
-        "expected": {name: error._asdict() for name, error in expected.items() if " below " not in name},
+        "expected": {name: error._asdict() for name, error in expected.items() if name in names},
         "slow_torques": {
             name: {"before": before[name], "after": after[name]} | error._asdict()
             for name, error in expected.items()
-            if " below " in name
+            if name not in names
         },
         "test": judgement.test,
     }

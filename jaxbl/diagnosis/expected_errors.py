@@ -53,8 +53,7 @@ class Expected(NamedTuple):
 def expected_errors(
     log: ReferenceLog, fitted: FittedModel, base: Comparison, noise: InputNoise, driving: float
 ) -> dict[str, Expected]:
-    """Errors of a model if it is complete, in positions, missing torques, and slow ones
-    (:meth:`.reference_log.ReferenceLog.slow`); speeds are the positions' over again.
+    """Errors of a model if it is complete, in positions and missing torques; speeds are the positions' over again.
 
     Args:
         log: held out.
@@ -62,15 +61,12 @@ def expected_errors(
         noise: of the input.
         driving: torque that drives the machine, rms, N m.
     """
-    random, slow = np.random.default_rng(0), log.slow(base.torques)
-    floor = log.noise_of(base)
-    samples = base.samples | slow
+    random, floor = np.random.default_rng(0), log.noise_of(base)
     values, vectors = np.linalg.eigh(fitted.white)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
     def apart(other: Comparison) -> Errors:
-        channels = other.samples | log.slow(other.torques)
-        return {name: float(np.mean((errors - samples[name]) ** 2)) for name, errors in channels.items()}
+        return {name: float(np.mean((errors - base.samples[name]) ** 2)) for name, errors in other.samples.items()}
 
     drawn = []
     for _ in range(_DRAWS):
@@ -82,8 +78,8 @@ def expected_errors(
     small = apart(replace(log, segments=segments).compare(fitted.experiment))
     for side in fitted.experiment.sides:
         ratio = float(fitted.experiment.drive.ratio(side))
+        small |= {name: (LIMITS.slow_torque * driving * ratio) ** 2 for name in floor if name.startswith(f"torque_{side}")}
         small[f"torque_{side}"] = (least * ratio) ** 2
-        small |= {name: (LIMITS.slow_torque * driving * ratio) ** 2 for name in slow if name.startswith(f"torque_{side} ")}
     expected, names = {}, [name for name in floor if not name.startswith("velocity")]
     for name in names:
         squares = np.array([squares_of[name] for squares_of in drawn])
@@ -91,7 +87,7 @@ def expected_errors(
         drawn_most = (1.0 + _NOISE_ERROR) ** 2 * _quantile(squares, LIMITS.failing / len(names))
         limit = (1.0 + unsure) ** 2 * floor[name] ** 2 + drawn_most + small[name]
         expected[name] = Expected(floor[name], float(np.sqrt(np.mean(squares))), small[name] ** 0.5, limit**0.5)
-    if any(name.startswith("torque") for name in list_failed(log.with_slow(base), expected)):
+    if any(name.startswith("torque") for name in list_failed(base.errors, expected)):
         for name, rounding in log.rounding(fitted.experiment).items():
             if name in expected:
                 limit = np.hypot(expected[name].limit, (1.0 + _NOISE_ERROR) * rounding)

@@ -35,6 +35,8 @@ _LEAST_IN_WINDOW = 20
 _SLOW = (2.0, 4.0, 8.0)
 """Factors between the bandwidth and those below which missing torques are looked at once more: noise of torques falls with
 the bandwidth to the power 2.5, so that slow ones show better there."""
+BELOW = " below "
+"""In the names of their channels."""
 _LEAST_VALUES = 8
 """Independent values of a slow torque on the log at least."""
 _BEFORE = 512
@@ -44,7 +46,8 @@ _STATES = 8
 
 
 Errors = dict[str, float]
-"""Rms errors by channel: `theta_e`, `velocity_motor`, `torque_motor` and so on."""
+"""Rms errors by channel: `theta_e`, `velocity_motor`, `torque_motor`, of slow torques `torque_motor below 12 Hz`, and so
+on."""
 _Part = tuple[int, int]
 """Number of a part of a log, and of how many."""
 
@@ -53,7 +56,7 @@ class Comparison(NamedTuple):
     """A model beside a log.
 
     Attributes:
-        errors: rms, by channel (`theta_e`, `theta_s`, `velocity_motor`, ..., `torque_motor`, ...).
+        errors: rms, by channel.
         torques: that the model lacks, by side, segment by segment.
         samples: the errors one by one, in the order of time; of positions and speeds shape (windows, samples), of torques
             behind the low-pass (samples,).
@@ -107,12 +110,11 @@ class ReferenceLog:
         return floor | _all_rms(deviations | self._narrow_torques(torques, "deviation"))
 
     def noise_of(self, compared: Comparison) -> Errors:
-        """Noise of each channel, slow torques among them: what the smoother finds or, where that is more, the white part of
-        a model's errors.
+        """Noise of each channel: what the smoother finds or, where that is more, the white part of a model's errors.
 
         Of a rough motion the smoother takes noise for motion; what a torque does to a position is never white.
         """
-        noises = self.noise_floor(compared.torques) | _all_rms(self.slow(compared.torques, "deviation"))
+        noises = self.noise_floor(compared.torques)
         for side, noise in self.noise.items():
             position = POSITION_CHANNELS[side]
             more = max(1.0, estimate_white_noise(list(compared.samples[position])) / noise)
@@ -122,22 +124,17 @@ class ReferenceLog:
             noises[position] *= np.hypot(1.0, compared.noise.get(position, 0.0))
         return noises
 
-    def with_slow(self, compared: Comparison) -> Errors:
-        """Errors of a comparison, and those of slow torques besides: `torque_motor below 12 Hz`, ..."""
-        return compared.errors | _all_rms(self.slow(compared.torques))
-
-    def slow(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
-        """Missing torques, or their noise, behind narrower low-passes, N m, by `torque_motor below 12 Hz` and so on."""
-        slow_torques = {}
-        for side, pieces in torques.items():
-            for cutoff in (self.bandwidth[side] / factor for factor in _SLOW):
-                if 2.0 * cutoff * sum(len(piece.time) * piece.period for piece in pieces) >= _LEAST_VALUES:
-                    slow_torques[f"torque_{side} below {cutoff:.3g} Hz"] = _join_narrow(pieces, cutoff, name)
-        return slow_torques
-
     def _narrow_torques(self, torques: SideResiduals, name: str = "torque") -> NamedArrays:
-        """Missing torques, or their noise, behind the low-pass, N m."""
-        return {f"torque_{side}": _join_narrow(pieces, self.bandwidth[side], name) for side, pieces in torques.items()}
+        """Missing torques, or their noise, N m: behind the low-pass by `torque_motor` and so on, and slow ones behind
+        narrower low-passes by `torque_motor below 12 Hz`."""
+        narrowed = {}
+        for side, pieces in torques.items():
+            narrowed[f"torque_{side}"] = _join_narrow(pieces, self.bandwidth[side], name)
+            duration = sum(len(piece.time) * piece.period for piece in pieces)
+            for cutoff in (self.bandwidth[side] / factor for factor in _SLOW):
+                if 2.0 * cutoff * duration >= _LEAST_VALUES:
+                    narrowed[f"torque_{side}{BELOW}{cutoff:.3g} Hz"] = _join_narrow(pieces, cutoff, name)
+        return narrowed
 
     def largest_departures(self, experiment: Experiment) -> Errors:
         """Measure how far a model departs from each side's motion on short windows from the smoothed states, over its range.
@@ -218,7 +215,7 @@ class ReferenceLog:
             window = segment[start : start + self.samples]
             pieces.append(replace(window, readings=readings, smoothed=smoothed, before=before))
         torques = residual_torques(experiment, pieces)
-        return _all_rms(self._narrow_torques(torques) | self.slow(torques))
+        return _all_rms(self._narrow_torques(torques))
 
     def missing(self, experiment: Experiment, name: str = "torque") -> NamedArrays:
         """Torques that a model lacks behind the low-pass, or their noise (`deviation`), N m, by side."""

@@ -330,11 +330,11 @@ def draw(diagnosis: Diagnosis) -> list[Figure]:
 
 def _over_time(diagnosis: Diagnosis) -> Figure:
     """Missing torque of each side, before and after."""
-    panels = []
+    panels, separate = [], diagnosis.summary["gap"]["holdout"]["separate"]
     for side, pieces in diagnosis.pairs.items():
         unit, bandwidth, parts = diagnosis.record.unit_of(f"{side}.torque", "N m"), diagnosis.located[side].bandwidth, []
         for before, after, held in pieces:
-            if held and not all(other for _, _, other in pieces):
+            if held and not separate:
                 parts.append(Span(before.time[0], before.time[-1], "held out", ORANGE, opacity=0.18))
             # behind the low-pass that the analysis used
             (first, _), (last, _) = narrow(before, bandwidth), narrow(after, bandwidth)
@@ -344,7 +344,7 @@ def _over_time(diagnosis: Diagnosis) -> Figure:
                 Line(last.time, last.torque, "after", BLUE, 0.9),
             ]
         panels.append(Panel(TIME, Axis(missing_label(f"{side}:\n", unit)), parts))
-    lead = f"Held-out log {diagnosis.holdout.path.name}: t" if diagnosis.summary["gap"]["holdout"]["separate"] else "T"
+    lead = f"Held-out log {diagnosis.holdout.path.name}: t" if separate else "T"
     caption = (
         f"{lead}orque that the model lacks, as given and with what was found, behind the low-pass that shows it most "
         "clearly. Of a complete model 19 in 20 samples lie within the grey band."
@@ -395,7 +395,7 @@ def draw_residual(
 
 def _means(coordinate: Coordinate) -> list[Line]:
     rows = [(0.5 * (bin_.low + bin_.high), bin_.mean, bin_.mean_error, bin_.mean_z) for bin_ in coordinate.regions]  # pyright: ignore
-    x, y, error, z = np.array(rows).reshape(-1, 4).T
+    x, y, error, z = np.transpose(rows)
     ends, points = intervals(x, y - 2.0 * error, y, y + 2.0 * error, "bin mean", upright=True, size=4.0)
     unsure = np.abs(z) <= 3.0
     hollow = points._replace(x=x[unsure], y=y[unsure], name="", fill="#FFFFFF")
