@@ -7,19 +7,16 @@ since noise of accelerations hides what is slow.
 Reference: A. Gelman et al., Bayesian Data Analysis (2013), 6.3.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
 
-from jaxbl.estimation.segments import Segment
-
 from .fitted_model import FittedModel
-from .input_noise import smoothed_input
 from .reference_log import Comparison, Errors, ReferenceLog
-from .setup import InputNoise
+from .setup import InputNoise, quiet
 from .thresholds import LIMITS
 
 _DRAWS = 6
@@ -71,8 +68,12 @@ def expected_errors(
     drawn = []
     for _ in range(_DRAWS):
         model = fitted.move_by(root @ random.standard_normal(len(root)))
-        segments = [_disturb(segment, noise, random) for segment in log.segments]
-        drawn.append(apart(replace(log, segments=segments).compare(model)))
+        segments = [
+            replace(segment, torque=segment.torque + noise.possible * random.standard_normal(len(segment)))
+            for segment in log.segments
+        ]
+        # smoothed as the input was
+        drawn.append(apart(replace(log, segments=quiet(segments, noise.unfelt)).compare(model)))
     least = LIMITS.least_torque * driving
     segments = [replace(segment, torque=segment.torque + least) for segment in log.segments]
     small = apart(replace(log, segments=segments).compare(fitted.experiment))
@@ -100,13 +101,7 @@ def list_failed(errors: Errors, expected: Mapping[str, Expected]) -> list[str]:
     return [name for name, channel in expected.items() if not errors[name] <= channel.limit < np.inf]
 
 
-def _disturb(segment: Segment, noise: InputNoise, random: np.random.Generator) -> Segment:
-    """A segment with other noise of its input, smoothed as the input was."""
-    torque = segment.torque + noise.possible * random.standard_normal(len(segment))
-    return replace(segment, torque=smoothed_input(torque, noise.unfelt) if noise.unfelt > 0.0 else torque)
-
-
-def _quantile(squares: Sequence[float] | np.ndarray, chance: float) -> float:
+def _quantile(squares: np.ndarray, chance: float) -> float:
     """Value that a sum of squares exceeds with some probability, from a few of them: by the gamma distribution of the same
     mean and variance (Satterthwaite)."""
     mean, variance = float(np.mean(squares)), float(np.var(squares, ddof=1))

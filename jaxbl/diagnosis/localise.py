@@ -11,18 +11,16 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.signal import find_peaks, periodogram
 
 from jaxbl.chain import Experiment
-from jaxbl.estimation.regression import Kinematics, balance
 from jaxbl.estimation.segments import Segment
-from jaxbl.fused.compilation import jit
-from jaxbl.records.least_squares import as_normal, rms
+from jaxbl.records.least_squares import as_normal
 
 from .coordinates import CoordinateValues
+from .linearised_model import find_driving_torque
 from .residuals import Residual, SideResiduals, mean_density, narrow
 from .thresholds import LIMITS
 
@@ -38,7 +36,7 @@ _LEAST_BLOCKS = 4
 """Blocks of time that a mean must come from to have a scatter."""
 _LEVEL_UNKNOWN = 0.05
 """Relative uncertainty of the noise's deviation."""
-RESOLUTION = 5e-4
+_RESOLUTION = 5e-4
 """Share of the driving torque below which sampling alone may be what is missing."""
 _NARROWER = 1.15
 """Factor by which the power behind a narrower low-pass must stand out more."""
@@ -363,14 +361,8 @@ def localise(
 ) -> dict[str, Localised]:
     """Locate where each side lacks torque, by its residuals (:func:`.residuals.residual_torques`), segment by segment, and
     the coordinates along them (:func:`.coordinates.all_coordinates`)."""
-    located, drives = {}, [_drives(experiment, segment.kinematics) for segment in segments]
-    for side, pieces in residuals.items():
-        driving = np.concatenate([np.asarray(driving_of[side]) for driving_of in drives])
-        located[side] = locate(pieces, coordinates[side], floor=RESOLUTION * rms(driving))
-    return located
-
-
-@jit
-def _drives(experiment: Experiment, kinematics: Kinematics) -> dict[str, jax.Array]:
-    """Torque that drives each equation, N m."""
-    return {name: equation.drive for name, equation in balance(experiment, kinematics).items()}
+    driving, _ = find_driving_torque(experiment, segments)
+    return {
+        side: locate(pieces, coordinates[side], floor=_RESOLUTION * driving * float(experiment.drive.ratio(side)))
+        for side, pieces in residuals.items()
+    }

@@ -11,7 +11,7 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.segments import Segment, segments_of, signal_sizes
-from jaxbl.records import POSITION_CHANNELS
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.signal_quality import estimate_white_noise
 
 from .coordinates import SideCoordinates, all_coordinates
@@ -99,14 +99,14 @@ def set_up(task: DiagnosisTask) -> Setup:
                 f"{record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
                 f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
             )
-    return _drive_by_input(task, bare, nominal, free, prior, recorded, _input_noise(input_rms(record), nominal, recorded))
+    return _drive_by_input(task, bare, nominal, free, prior, recorded, _input_noise(record, nominal, recorded))
 
 
 def doubt_input(setup: Setup, model: Experiment) -> Setup | None:
     """Set up anew if a model shows that noise of the recorded input did not act; None if it does not."""
     if setup.input_noise.unfelt > 0.0:
         return None
-    noise = _input_noise(input_rms(setup.task.record), model, setup.recorded)
+    noise = _input_noise(setup.task.record, model, setup.recorded)
     if not noise.unfelt > 0.0:
         return None
     return _drive_by_input(setup.task, setup.bare, setup.nominal, setup.free, setup.prior, setup.recorded, noise)
@@ -134,11 +134,11 @@ def quiet(segments: Sequence[Segment], noise: float) -> Sequence[Segment]:
     return [dataclasses.replace(segment, torque=smoothed_input(segment.torque, noise)) for segment in segments]
 
 
-def _input_noise(size: float, model: Experiment, segments: Sequence[Segment]) -> InputNoise:
+def _input_noise(record: Record, model: Experiment, segments: Sequence[Segment]) -> InputNoise:
     """Noise of the channel that recorded the input, and whether the drive felt it by a model; where it is small beside the
-    input's rms `size`, that is not asked."""
+    input's rms, that is not asked."""
     noise = estimate_white_noise([segment.torque for segment in segments])
-    if not _NOISY * size < noise:
+    if not _NOISY * input_rms(record) < noise:
         return InputNoise(0.0, noise)
     # at the model's numbers: those that may change would absorb some of the noise
     recorded, smooth = (Linear(model, (), np.zeros(0), np.zeros(0), driven) for driven in (segments, quiet(segments, noise)))
