@@ -127,7 +127,7 @@ class Localised:
     Attributes:
         name: of the side.
         bandwidth: of what is looked at, Hz.
-        rms, noise: of residual and noise within it, N m.
+        noise: rms within it, N m.
         missing: rms beyond the noise, N m.
         excess_z: its significance.
         significant: whether there is anything beyond noise, as a whole or in a region.
@@ -137,7 +137,6 @@ class Localised:
 
     name: str
     bandwidth: float
-    rms: float
     noise: float
     missing: float
     excess_z: float
@@ -232,8 +231,8 @@ def locate(
         or any(peak.excess_z > LIMITS.significant and peak.amplitude > floor for peak in peaks)
     )
     return Localised(
-        residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(power / joined.count)),
-        float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), over, peaks,
+        residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), over,
+        peaks,
     )  # fmt: skip
 
 

@@ -193,15 +193,12 @@ def _parting(
     assert record.torque is not None
     first_model = models[0]
     sides = [side for side in first_model.sides if side in record.positions]
-    noise = reading_noise(segments_of(record, sides))
+    segments = segments_of(record, sides)
+    noise = reading_noise(segments)
     largest = np.max(np.abs(record.torque)) if torque is None else torque
     inputs = _inputs(record, max(largest - abs(bias), 0.0), bias)
     torques = jnp.asarray(np.stack([trial.torque for trial in inputs]))
-    start = {
-        side: jnp.asarray(float(np.median(np.concatenate([values[part] for part in record.segments]))))
-        for side, values in record.positions.items()
-        if side in sides
-    }
+    start = {side: jnp.median(np.concatenate([segment.readings[side] for segment in segments])) for side in sides}
     if len(first_model.sides) == 2:
         ratio = jnp.asarray(float(first_model.drive.ratio("load")))
         start.setdefault("load", start["motor"] / ratio)
@@ -210,7 +207,7 @@ def _parting(
     apart, inside = np.zeros(len(inputs)), np.ones(len(inputs), bool)
     for side in sides:
         if travel is None:
-            reach = max(np.ptp(record.positions[side][part]) for part in record.segments)
+            reach = max(np.ptp(segment.readings[side]) for segment in segments)
         else:
             reach = travel / abs(float(first_model.drive.ratio(side)))
         # of a path that diverges nothing is finite, and it is not inside

@@ -104,8 +104,8 @@ def _read_numbers(fitted: FittedModel, log: ReferenceLog) -> _Reading:
             torque = np.hypot(torque, size / float(fitted.experiment.drive.ratio(side)))
             # of a number that has nothing to do with this side
             lost = np.fmin(lost, np.mean(noise**2) / size**2)
-        beside = np.zeros((len(friction) * len(now), len(missing)))
-        beside[i * len(friction) : (i + 1) * len(friction)] = friction[:, moving]
+        # columns of their own for each side
+        beside = np.kron(np.eye(len(now))[:, [i]], friction[:, moving])
         size = max(rms(every_row), 1e-300)
         sides.append(BlockRegression.of(-missing / size, np.concatenate([slopes, beside]).T / size))
     regression = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
