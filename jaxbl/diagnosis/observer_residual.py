@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
-from jaxbl.chain import Experiment, Signals, State, TracedArrays, initial_observer_state, initial_state, replay
+from jaxbl.chain import Experiment, Signals, State, TracedArrays, initial_observer_state, replay
 from jaxbl.estimation.regression import Kinematics
 from jaxbl.estimation.segments import Segment
 from jaxbl.fused.compilation import jit
@@ -117,12 +118,11 @@ def _controls(
         return {side: signals.side(side).equivalent_control for side in experiment.sides}
 
     def run(measured: TracedArrays) -> TracedArrays:
-        begin = initial_state(experiment, {side: values[0] for side, values in measured.items()})
         observers = {
             side: initial_observer_state(experiment, side, part.position[side][0], part.velocity[side][0])
             for side in experiment.sides
         }
-        state = State(None, observers, begin.equivalent_control, begin.identifier)
+        state = State(None, observers, dict.fromkeys(experiment.sides, jnp.zeros(())), None)
         return replay(experiment, torque, measured, record=keep, state=state, added_accelerations=added)[1]
 
     return jax.vmap(run)(readings)
