@@ -298,13 +298,6 @@ def _sums(torque: np.ndarray, row: np.ndarray, rows: int, index: np.ndarray, bin
     return sums, numbers
 
 
-def _folds(joined: _Joined, name: str, count: int) -> np.ndarray:
-    """To which fold each sample belongs; over time, whose moments do not come again, each bin is parted among the folds."""
-    if name != "time":
-        return joined.block % _FOLDS
-    return np.concatenate([_divide(part, count * _FOLDS) for part in joined.parts]) % _FOLDS
-
-
 def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, excess: float) -> float:
     if joined.z < LIMITS.significant:
         # nothing to be shared out
@@ -313,7 +306,11 @@ def _explained_share(name: str, values_of: CoordinateValues, joined: _Joined, ex
     counts = [n for n in _COUNTS if n * least <= max(joined.effective / _IN_A_BIN, 2 * least)]
     for count in [1] if values_of.classes else counts:
         _, index, bins = _bin_samples(name, values_of, np.linspace(0.0, 1.0, count + 1))
-        fold = _folds(joined, name, bins)
+        piece = joined.block
+        if name == "time":
+            # moments do not come again: each bin is parted among the folds
+            piece = np.concatenate([_divide(part, bins * _FOLDS) for part in joined.parts])
+        fold = piece % _FOLDS
         sums, numbers = _sums(joined.torque, fold, _FOLDS, index, bins)
         other_counts = np.sum(numbers, axis=0) - numbers
         predicted = ((np.sum(sums, axis=0) - sums) / np.maximum(other_counts, 1))[fold, index]

@@ -137,7 +137,7 @@ def _leave_out_each(
     for name in chosen.fitted.names:
         less = without(model, name)
         compared = log.compare(less)
-        torques = {key: _torque_between(part, model, less) for key, part in (("torque", log), ("on_log", setup.fitted))}
+        torques = {"torque": _torque_between(log, model, less), "on_log": _torque_between(setup.fitted, model, less)}
         if torques["torque"] > ACTS * torques["on_log"]:
             holdout_z[name] = standard_errors_better(log, compared, after)
         if not list_failed(compared.errors, expected):

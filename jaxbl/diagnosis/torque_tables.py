@@ -134,26 +134,28 @@ def _fit_tables(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, ro
         for over, points in choices.items()
     }
     nothing = np.array([np.mean(part**2) for part in np.array_split(target, BLOCKS)])
-    fits_found = []
+    trials = []
     # coordinates alone, then a position with the speed
     for overs in [*([over] for over in choices), *([over, "speed"] for over in choices if over != "speed")]:
         if len(target) < _LEAST * sum(widths[over] for over in overs):
             continue
         matrix = np.concatenate([columns[over] for over in overs], axis=1)
-        fits = [_Fit.of(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
-        fit = min(fits, key=lambda candidate: np.mean(candidate.squares))
-        gain = nothing - fit.squares
+        regressions = [_regress(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
+        # mean squared errors of each block left out
+        squares, regression = min(((fit.held_out(), fit) for fit in regressions), key=lambda trial: np.mean(trial[0]))
+        gain = nothing - squares
         sure = np.mean(gain) > mean_error(gain)
-        if sure and 1.0 - np.sqrt(np.mean(fit.squares) / np.mean(nothing)) > _GAIN:
-            fits_found.append((overs, fit))
-    if not fits_found:
+        if sure and 1.0 - np.sqrt(np.mean(squares) / np.mean(nothing)) > _GAIN:
+            trials.append((overs, squares, regression))
+    if not trials:
         return []
-    _, best = min(fits_found, key=lambda candidate: np.mean(candidate[1].squares))
+    _, best, _ = min(trials, key=lambda trial: np.mean(trial[1]))
     # the fewest tables of those within one standard error of the best
-    limit = np.mean(best.squares) + mean_error(best.squares - nothing)
-    overs, fit = next((overs, candidate) for overs, candidate in fits_found if np.mean(candidate.squares) <= limit)
+    limit = np.mean(best) + mean_error(best - nothing)
+    overs, _, regression = next(trial for trial in trials if np.mean(trial[1]) <= limit)
+    left_out = [regression.fit(np.flatnonzero(parts_of_blocks(QUARTERS) == part)) for part in range(QUARTERS)]
     ends = np.cumsum([widths[over] for over in overs])[:-1]
-    parts = (np.split(values, ends, axis=-1) for values in (fit.values, fit.errors, fit.left_out))
+    parts = (np.split(values, ends, axis=-1) for values in (regression.fit(), regression.errors(), np.stack(left_out)))
     return [Table(*columns) for columns in zip(overs, [choices[over] for over in overs], *parts, strict=True)]
 
 
@@ -179,22 +181,11 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     return low_passed(as_smoothed(hats, smoothed, segment.period), lacking, cutoff).T
 
 
-class _Fit(NamedTuple):
-    """Penalised least squares: values, their standard errors, mean squared errors of each block left out, and values without
-    one quarter of the blocks after the other."""
-
-    values: np.ndarray
-    errors: np.ndarray
-    squares: np.ndarray
-    left_out: np.ndarray
-
-    @classmethod
-    def of(cls, matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> "_Fit":
-        second = np.asarray(block_diag(*(np.diff(np.eye(width), n=2, axis=0) for width in widths)))
-        penalty = (_RIDGE * np.eye(matrix.shape[1]) + stiffness * second.T @ second) * (np.mean(matrix**2) * len(target))
-        regression = BlockRegression.of(target, matrix, BLOCKS, penalty)
-        left_out = np.stack([regression.fit(np.flatnonzero(parts_of_blocks(QUARTERS) == part)) for part in range(QUARTERS)])
-        return cls(regression.fit(), regression.errors(), regression.held_out(), left_out)
+def _regress(matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> BlockRegression:
+    """Prepare penalised least squares of a torque on the columns of tables with so many points each."""
+    second = np.asarray(block_diag(*(np.diff(np.eye(width), n=2, axis=0) for width in widths)))
+    penalty = (_RIDGE * np.eye(matrix.shape[1]) + stiffness * second.T @ second) * (np.mean(matrix**2) * len(target))
+    return BlockRegression.of(target, matrix, BLOCKS, penalty)
 
 
 def _numbers(tables: Sequence[Table]) -> JsonObject:
