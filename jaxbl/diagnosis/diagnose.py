@@ -16,13 +16,11 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.feedback_bias import find_feedback_bias
 from jaxbl.estimation.free_parameters import free_values
 from jaxbl.estimation.logs import Logs, arrays, gains_for
-from jaxbl.estimation.segments import at_period
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
-from .blocks import standard_errors_better
 from .choice import Choice, Chosen
 from .confidence import confirm, explained_share
 from .coordinates import SideCoordinates, all_coordinates
@@ -155,7 +153,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         missing = _missing(setup, proof, chosen, lacking_after)
         observing = set_leaves(setup.bare, arrays(gain_values))
         # nothing is decided by them
-        unseen = {} if task.separate else observed_torques(at_period(observing, proof.log.period), proof.log.segments)
+        unseen = {} if task.separate else observed_torques(observing, proof.log.segments)
         observed = observed_torques(observing, setup.fitted.segments), unseen
         trace = trace_of(setup, proof, missing, observed)
         done()
@@ -176,17 +174,17 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
             left = localise(fitted.experiment, lacking_after, segments, coordinates)
             summary["where_after"] = where_lacking(task.record, left)
         if tables is not None:
-            with_tables = proof.log.compare(tables.experiment)
-            better = standard_errors_better(proof.log, proof.after, with_tables)
-            summary["torque_tables"] = tables.summarise(with_tables.errors, better)
+            summary["torque_tables"] = tables.summarise(proof.log, proof.after)
         if chosen.rival is not None:
             summary["rival"] = rival_tables(task.config, task.record, setup.free, chosen.rival)
         done()
-    logs = [(proof.before.torques, proof.after.torques, True)]
-    if not task.separate:
-        logs.insert(0, (setup.lacking, lacking_after, False))
+    before, after = missing["missing_before"], missing["missing_after"]
     pairs = {
-        side: [(*pair, held_out) for before, after, held_out in logs for pair in zip(before[side], after[side], strict=True)]
+        side: [
+            (*pair, bool(part))
+            for part in ([1] if task.separate else [0, 1])
+            for pair in zip(before[part][side], after[part][side], strict=True)
+        ]
         for side in setup.lacking
     }
     return Diagnosis(

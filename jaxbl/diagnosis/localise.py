@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.signal import find_peaks, periodogram
+from scipy.special import diric
 
 from jaxbl.chain import Experiment
 from jaxbl.estimation.segments import Segment
@@ -275,10 +276,9 @@ def _mean_error(
     if name == "time":
         # each moment comes but once: by the noise that remains in a mean over so many samples
         wave = np.linspace(1e-9, np.pi, _WAVES)
-        share = [np.sinc(0.5 * n * wave / np.pi) ** 2 / np.sinc(0.5 * wave / np.pi) ** 2 for n in number]
         densities = np.mean([part.density_at(wave) / mean_density(part.density) for part in joined.parts], axis=0)
         square = np.bincount(index, joined.deviation**2, count) / number
-        error = np.sqrt(square * [mean_density(densities * passed) for passed in share])
+        error = np.sqrt(square * [mean_density(densities * diric(wave, n) ** 2) for n in number])
         return error, mean / np.maximum(error, np.finfo(float).tiny)
     sums, numbers = _sums(joined.torque, joined.block, joined.blocks, index, count)
     # blocks with few samples of a bin are no block of their own

@@ -16,7 +16,7 @@ import numpy as np
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.estimation.logs import arrays
 from jaxbl.json_types import JsonObject
-from jaxbl.records.least_squares import BlockRegression, rms
+from jaxbl.records.least_squares import BlockRegression, column_rms, rms
 
 from .diagnosis_task import DiagnosisTask
 from .fitted_model import FittedModel
@@ -100,7 +100,7 @@ def _read_numbers(fitted: FittedModel, log: ReferenceLog) -> _Reading:
         slopes = np.stack([(torques[side][moving] - missing) / _STEP for torques in moved])
         count += len(missing)
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-            size = np.sqrt(np.nan_to_num(np.mean(slopes**2, axis=1)))
+            size = np.nan_to_num(column_rms(slopes.T))
             torque = np.hypot(torque, size / float(fitted.experiment.drive.ratio(side)))
             # of a number that has nothing to do with this side
             lost = np.fmin(lost, np.mean(noise**2) / size**2)

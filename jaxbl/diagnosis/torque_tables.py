@@ -20,7 +20,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records.least_squares import BlockRegression, mean_error
 
 from .blocks import QUARTERS, standard_errors_better
-from .reference_log import BLOCKS, Comparison, Errors, ReferenceLog, parts_of_blocks
+from .reference_log import BLOCKS, Comparison, ReferenceLog, parts_of_blocks
 from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrow
 from .thresholds import LIMITS
 
@@ -74,9 +74,10 @@ class Tabulation(NamedTuple):
         """The tables as effects of a study."""
         return [{"kind": f"{side}.{Tabulated.kind}"} | _numbers(tables) for side, tables in self.tables.items()]
 
-    def summarise(self, errors: Errors, z: float) -> JsonObject:
-        """Write the tables as JSON; `errors` are those of the model with them on what was held out, `z` the standard errors
-        by which it is better there."""
+    def summarise(self, held_out: ReferenceLog, compared: Comparison) -> JsonObject:
+        """Write the tables as JSON, and how the model with them compares on what was held out; `compared`: the model without
+        them there."""
+        with_tables = held_out.compare(self.experiment)
         return {
             "tables": {
                 side: [{"over": table.over, "points": table.points, "torques": table.torques, "errors": table.errors}
@@ -84,8 +85,8 @@ class Tabulation(NamedTuple):
                 for side, tables in self.tables.items()
             },
             "z": self.z,
-            "holdout_z": z,
-            "holdout_rmse": errors,
+            "holdout_z": standard_errors_better(held_out, compared, with_tables),
+            "holdout_rmse": with_tables.errors,
         }  # fmt: skip
 
 
