@@ -59,7 +59,7 @@ def read_diagnosis_task(log: Logs, model: ConfigSource, *, holdout: Logs | None 
 def input_rms(record: Record) -> float:
     """Return the rms of the input on all segments of a log, N m."""
     assert record.torque is not None
-    return rms(record.torque[_list_rows(record)])
+    return rms(record.torque[np.r_[record.segments]])
 
 
 def _long(record: Record) -> Record:
@@ -75,17 +75,12 @@ def _long(record: Record) -> Record:
 
 def can_hold_out(record: Record) -> bool:
     """Tell whether a log is long enough for a quarter of it to be held out."""
-    return HELD_OUT * len(_list_rows(record)) >= _LEAST_SAMPLES
-
-
-def _list_rows(record: Record) -> np.ndarray:
-    """List the rows of a log's segments."""
-    return np.concatenate([np.r_[part] for part in record.segments])
+    return HELD_OUT * len(np.r_[record.segments]) >= _LEAST_SAMPLES
 
 
 def split_off_last_quarter(record: Record) -> tuple[Record, Record]:
     """The samples to be fitted, and those held out: the last of the log, at their own times."""
-    rows = _list_rows(record)
+    rows = np.r_[record.segments]
     if not can_hold_out(record):
         raise InputError(
             f"{record.path}: {len(rows)} samples are too few to hold a quarter of them out; at least "

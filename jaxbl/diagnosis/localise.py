@@ -249,8 +249,7 @@ def _bin_samples(name: str, coordinate: CoordinateValues, shares: np.ndarray) ->
         edges = np.linspace(low, max(high, np.nextafter(low, np.inf)), len(shares))
     else:
         edges = np.unique(np.quantile(coordinate.values, shares))
-    count = len(edges) - 1
-    return edges, np.clip(np.searchsorted(edges, coordinate.values, "right") - 1, 0, count - 1), count
+    return edges, np.digitize(coordinate.values, edges[1:-1]), len(edges) - 1
 
 
 def _over_coordinate(name: str, values_of: CoordinateValues, joined: _Joined, excess: float) -> Coordinate:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float
+from scipy.signal import detrend
 
 from jaxbl.chain import Experiment, plant_trajectory
 from jaxbl.config import Config, read_config, with_values
@@ -215,10 +216,8 @@ def _parting(
             first, second = (np.asarray(path[side]) for path in paths)
             for path in (first, second):
                 inside &= np.ptp(path, axis=1) <= reach
-            difference = second - first
-            basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, difference.shape[1]), 2))
-            left = difference - (difference @ basis) @ basis.T
-            apart += 0.5 * np.sum((left / noise[side]) ** 2, axis=1)
+            left = detrend(np.where(inside[:, None], second - first, 0.0))
+        apart += 0.5 * np.sum((left / noise[side]) ** 2, axis=1)
     if not inside.any():
         return None
     best = int(np.argmax(np.where(inside, apart, -1.0)))
