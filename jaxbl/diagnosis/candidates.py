@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
+from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.estimation.regression import Path, Samples, SideSamples, effect_path, remembers_input
 from jaxbl.fused.compilation import jit
 
@@ -85,6 +86,12 @@ class Candidate:
     offset: bool = False
     from_rest: bool = False
     spread: float = 0.0
+
+
+def owner_of(number: FreeParameter) -> tuple[str, str]:
+    """Return the effect that a number is of, and its name there."""
+    name, _, leaf = number.path.removeprefix("effects.").rpartition(".")
+    return name, leaf
 
 
 def are_possible(effects: EffectNumbers, period: float) -> bool:
@@ -203,7 +210,7 @@ def _trial(name: str, fixed: Numbers, from_rest: bool) -> Candidate:
         (change,) = values
         return fixed | {leaf: value * math.exp(change)} if abs(change) < REACH else None
 
-    return Candidate(name, 1, effects, columns, numbers_of, offset=True, from_rest=from_rest)
+    return Candidate(name, 1, effects, columns, numbers_of, offset=True, from_rest=from_rest, spread=SPACING)
 
 
 class Forces:

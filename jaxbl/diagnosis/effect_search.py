@@ -23,7 +23,7 @@ from jaxbl.records.least_squares import column_rms
 from jaxbl.workers import announce
 
 from .blocks import standard_errors_better, standard_errors_between
-from .candidates import Candidate, EffectNumbers, are_possible, contains, is_finer_law, replaces, variants_of
+from .candidates import Candidate, EffectNumbers, are_possible, contains, is_finer_law, owner_of, replaces, variants_of
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
 from .free_functions import functions_of
@@ -31,7 +31,7 @@ from .history import Step, describe_change
 from .linearised_model import Linear, Predictor
 from .neutral_effects import candidates, find_corrected
 from .reference_log import Comparison, ReferenceLog
-from .refit import ModelFits, owner_of
+from .refit import ModelFits
 from .thresholds import LIMITS
 from .torque_regression import SHOWN, TorqueRegression
 
@@ -478,9 +478,7 @@ class EffectSearch:
     def _vary(self, current: FittedModel, names: Sequence[str]) -> tuple[Linear, Predictor, list[Candidate]]:
         """List the variants of effects that a log may show, and linearise a model along it, with its predictor."""
         linear = self.fits.linearise(current.numbers, current.theta[: len(self.fits.prior)])
-        # waves and frequencies are sought in what this predictor leaves
-        predictor = linear.choose(())
-        return linear, predictor, variants_of(self.fits.nominal, names, linear.scales)
+        return linear, linear.chosen, variants_of(self.fits.nominal, names, linear.scales)
 
     def _propose(self, current: FittedModel) -> list[_Proposal]:
         """Propose effects that may be missing, most promising first."""
@@ -530,13 +528,13 @@ class EffectSearch:
         if not np.isfinite(predictor.deviation).all():
             # no predictor follows this model
             return []
-        columns = linear.columns(variants, predictor.smoothness, predictor.deviation)
-        base = evidence_of(columns)
+        alone, *models = linear.products(variants, predictor.smoothness, predictor.deviation)
+        base = evidence_of(alone)
         assert base is not None
         best: dict[str, _Proposal] = {}
-        for i, variant in enumerate(variants):
+        for variant, products in zip(variants, models, strict=True):
             gone = [name for name in names if name == variant.name or replaces(variant.name, name)]
-            evidence = evidence_of(_without(columns, linear, gone) if gone else columns, variants, i)
+            evidence = evidence_of(_without(products, linear, gone), variant)
             if evidence is not None:
                 nats = self._nats(linear, base, evidence) - linear.choices(variant.name)
                 if nats > (best[variant.name].nats if variant.name in best else least):
@@ -554,16 +552,15 @@ class EffectSearch:
     def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
         """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
         linear = fitted.linear
-        predictor, functions = linear.choose(()), functions_of(linear.signals)
-        columns = linear.columns(functions, predictor.smoothness, predictor.deviation)
-        gained = {}
-        for i, function in enumerate(functions):
+        functions, gained = functions_of(linear.signals), {}
+        alone, *models = linear.products(functions, linear.chosen.smoothness, linear.chosen.deviation)
+        none = evidence_of(alone)
+        for function, columns in zip(functions, models, strict=True):
             best = (-np.inf, 0.0)
             for size in _SIZES:
                 scale = columns.scale.copy()
-                scale[list(columns.places[i])] *= size
-                sized = dataclasses.replace(columns, scale=scale)
-                none, with_function = evidence_of(sized), evidence_of(sized, functions, i)
+                scale[1 + columns.own_count :] *= size
+                with_function = evidence_of(dataclasses.replace(columns, scale=scale), function)
                 # columns that are all but alike may have no solution
                 if none is not None and with_function is not None:
                     nats = self._nats(linear, none, with_function)

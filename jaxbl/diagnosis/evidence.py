@@ -23,11 +23,9 @@ class Products:
 
     Attributes:
         products: of all columns with one another, over the errors' variance, initial states eliminated; shape
-            (columns, columns). Order: constant, own numbers, then each variant's columns and offset. Those of different
-            variants may be left out: no two are in a model at once.
+            (columns, columns). Order: constant, own numbers, then a candidate's columns, and what is there without them.
         own_count: number of the model's own numbers.
-        places: columns of each variant.
-        offsets: column of each variant's offset, or -1.
+        has_offset: whether the last column is there whatever the candidate's coefficients are.
         scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
         centre: prior mean of each.
         twins: columns that are a multiple of one of the model's own, which is always there: that one, and the factor. Only
@@ -36,8 +34,7 @@ class Products:
 
     products: np.ndarray
     own_count: int
-    places: tuple[tuple[int, ...], ...]
-    offsets: tuple[int, ...]
+    has_offset: bool
     scale: np.ndarray
     centre: np.ndarray
     twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
@@ -59,20 +56,18 @@ class Evidence(NamedTuple):
     own_change: np.ndarray
 
 
-def evidence_of(columns: Products, variants: Sequence[Candidate] = (), index: int | None = None) -> Evidence | None:
-    """Evidence of one of the candidates, or of the model without any; None where the numbers are not allowed.
+def evidence_of(columns: Products, candidate: Candidate | None = None) -> Evidence | None:
+    """Evidence of a model with a candidate, or without any; None where the numbers are not allowed.
 
     A candidate that is linear about a value that was tried is left at this value where it would have to go too far.
     """
-    if index is None:
-        return _evidence(columns, (), -1, None)
-    places, offset = columns.places[index], columns.offsets[index]
-    evidence = _evidence(columns, places, offset, variants[index])
-    return _evidence(columns, (), offset, variants[index]) if evidence is None and offset >= 0 else evidence
+    places = range(1 + columns.own_count, len(columns.products) - columns.has_offset)
+    evidence = _evidence(columns, places, candidate)
+    return _evidence(columns, (), candidate) if evidence is None and columns.has_offset else evidence
 
 
-def _evidence(c: Products, places: Sequence[int], offset: int, candidate: Candidate | None) -> Evidence | None:
-    fixed = np.array([0] if offset < 0 else [0, offset])
+def _evidence(c: Products, places: Sequence[int], candidate: Candidate | None) -> Evidence | None:
+    fixed = np.array([0, -1] if c.has_offset else [0])
     # what has no torque along this record has no coefficient either
     alive = [k for k in (*range(1, 1 + c.own_count), *places) if np.isfinite(c.scale[k])]
     variance, middle = c.scale**2, c.centre.copy()

@@ -17,11 +17,13 @@ Automatica 24 (1988), for the local approach.
 # pyright: reportArgumentType=false
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.signal import find_peaks
 
 from jaxbl.chain import Experiment
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, Scales
@@ -40,7 +42,7 @@ from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.records.least_squares import rms
 from jaxbl.workers import map_in_threads
 
-from .candidates import REACH, SPACING, Candidate, Forces, MotionTorques, Part, columns_of
+from .candidates import REACH, Candidate, Forces, MotionTorques, Part, columns_of, owner_of
 from .evidence import Products
 from .neutral_effects import bucket, find_corrected, lean, with_torques
 from .thresholds import LIMITS
@@ -317,9 +319,6 @@ class Linear:
         self.input_gain = float(_figures(self.experiment)[0])
         self.drive, self.driven = find_driving_torque(self.experiment, segments)
         self._noise, self._scales = reading_noise(segments), dict[str, Scales]()
-        # what the last search chose, and what the one without candidates did, which is asked for again and again
-        self._last: tuple[Predictor, list[Forces]] | None = None
-        self._alone: tuple[Predictor, list[Forces]] | None = None
 
     def scales(self, name: str) -> Scales:
         """Measure how large things are on the record, as an effect sees them; frequencies are sought anew each time."""
@@ -394,16 +393,13 @@ class Linear:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
         return [_errors(part, find_gains(smoothness, self.period), Forces(())) for part in self.parts]
 
+    @cached_property
+    def chosen(self) -> Predictor:
+        """The predictor with the least errors, without candidates."""
+        return self.choose(())
+
     def choose(self, variants: Sequence[Candidate], near: Sequence[float] | None = None) -> Predictor:
         """The predictor with the least errors, some candidates taken in; the search begins at a smoothness of each side."""
-        if variants or near is not None:
-            self._last = self._search(variants, near)
-        else:
-            self._last = self._alone = self._alone or self._search((), None)
-        return self._last[0]
-
-    def _search(self, variants: Sequence[Candidate], near: Sequence[float] | None) -> tuple[Predictor, list[Forces]]:
-        """The predictor with the least errors, and the candidates' torques."""
         forces = [Forces(columns_of(variants, signals)) for signals in self.signals]
         begin = [[float(q)] * len(self.sides) for q in _COARSE_SMOOTHNESS] if near is None else [list(near)]
         chosen = min(self._predictors(begin, forces), key=lambda predictor: predictor.log_square)
@@ -411,7 +407,7 @@ class Linear:
             now, least = chosen.smoothness, _COARSE_SMOOTHNESS[0]
             options = [[max(float(q * f), least) if j == i else q for j, q in enumerate(now)] for f in _FINE_SMOOTHNESS]
             chosen = min(chosen, *self._predictors(options, forces), key=lambda predictor: predictor.log_square)
-        return chosen, forces
+        return chosen
 
     def _predictors(self, options: list[list[float]], forces: list[Forces]) -> list[Predictor]:
         gains = [find_gains(smoothness, self.period) for smoothness in options]
@@ -427,7 +423,7 @@ class Linear:
         size = 4 * 2 ** int(np.ceil(np.log2(len(slope))))
         frequency = np.fft.rfftfreq(size, self.period)
         inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)
-        return _peaks(frequency, np.abs(np.fft.rfft(slope, size)) ** 2, few, power, inside, 1.0 / span)
+        return _peaks(frequency, np.abs(np.fft.rfft(slope, size)) ** 2, few, power, inside, size // len(slope) + 1)
 
     def waves(self, place: str) -> list[float]:
         """Periods a turn at which a torque over the position of a side explains most."""
@@ -442,7 +438,7 @@ class Linear:
             power += more
         number = np.arange(_PLACES // 2 + 1.0)
         inside = (number * self._scales[place].travel > TRIAL_ARC) & (number <= count)
-        return _peaks(number, np.abs(np.fft.rfft(by_place)) ** 2, few, power, inside, 0.0)
+        return _peaks(number, np.abs(np.fft.rfft(by_place)) ** 2, few, power, inside, 1)
 
     def _wave_count(self, place: str) -> int:
         """Number of waves a turn that samples still tell apart where the side moves as fast as in a quarter of the log."""
@@ -450,17 +446,15 @@ class Linear:
         return int(np.clip(0.5 * np.pi / max(float(np.quantile(speed, 0.25)) * self.period, 1e-9), 1, _MOST_WAVES))
 
     def _answer(self, i: int, place: str, few: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tell what a torque on a side does to the prediction errors of a part, under what the last call of :meth:`choose`
-        chose, at what it left over: their derivative by the torque at each sample, shape (samples,); and the power of the
-        response to waves of `few` periods along a `phase`, shape (waves,)."""
-        assert self._last is not None
-        part, side = self.parts[i], self.sides.index(place)
-        predictor, forces = self._last
+        """Tell what a torque on a side does to the prediction errors of a part under the :attr:`chosen` predictor, at what
+        that leaves over: their derivative by the torque at each sample, shape (samples,); and the power of the response to
+        waves of `few` periods along a `phase`, shape (waves,)."""
+        part, side, predictor = self.parts[i], self.sides.index(place), self.chosen
         gain, deviation = find_gains(predictor.smoothness, self.period), predictor.deviation
         if not np.isfinite(deviation).all():
             # no predictor follows this model
             return np.zeros(self.signals[i].samples), np.ones(len(few))
-        left = _errors(part, gain, forces[i]) @ predictor.coefficients[i]
+        left = _errors(part, gain, Forces(())) @ predictor.coefficients[i]
         along = few[:, None] * phase[None, :]
         waves = Forces([{side: np.concatenate([np.sin(along), np.cos(along)])}])
         responses = _errors(part, gain, waves)[:, :, 1 + part.by_number.shape[2] : -self.states]
@@ -473,60 +467,54 @@ class Linear:
         parts = self.errors(smoothness), self.predictor(smoothness).coefficients, self.signals
         return [(errors @ coefficients)[signals.real] for errors, coefficients, signals in zip(*parts, strict=True)]
 
-    def columns(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> Products:
-        """Products of everything that the prediction errors are linear in, columns of candidates among it, initial states
-        eliminated; `noise`: rms of the errors by side, rad. Products of different
-        candidates are there for some only."""
+    def products(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> list[Products]:
+        """Products of everything that the prediction errors are linear in, initial states eliminated: of the model alone,
+        and then with each candidate; `noise`: rms of the errors by side, rad."""
+        gain, groups = find_gains(smoothness, self.period), _groups(variants)
+        forces_of_all = [[Forces(columns_of(group, signals)) for signals in self.signals] for group in groups]
+
+        def multiply(forces: list[Forces]) -> tuple[np.ndarray, np.ndarray]:
+            pairs = list(zip(self.signals, forces, strict=True))
+            grams = [np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], force)[0]) for signals, force in pairs]
+            power = np.sum([self._power(force, signals) for signals, force in pairs], axis=0)
+            return np.sum([_eliminate(gram, self.states) for gram in grams], axis=0), power
+
         # the constant and the own numbers come first
-        gain, shared, groups = find_gains(smoothness, self.period), 1 + len(self.free), _groups(variants)
-        places, offsets, end = [], [], shared
-        for variant in variants:
-            places.append(tuple(range(end, end + variant.width)))
-            end += variant.width
-            offsets.append(end if variant.offset else -1)
-            end += variant.offset
+        shared, models = 1 + len(self.free), list[Products]()
+        for group, (gram, power) in zip(groups, map_in_threads(multiply, forces_of_all), strict=True):
+            if not models:
+                models.append(self._products_of(None, gram[:shared, :shared], power))
+            end = shared
+            for variant in group:
+                begin, end = end, end + variant.width + variant.offset
+                rows = [*range(shared), *range(begin, end)]
+                models.append(self._products_of(variant, gram[np.ix_(rows, rows)], power[begin - shared : end - shared]))
+        return models
 
-        def products(signals: MotionTorques, forces: Forces) -> tuple[np.ndarray, np.ndarray]:
-            gram = np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], forces)[0])
-            return _eliminate(gram, self.states), self._power(forces, signals)
+    def _products_of(self, variant: Candidate | None, products: np.ndarray, power: np.ndarray) -> Products:
+        """Add what is known of the coefficients; `power`: sums of squares of a candidate's torques."""
+        spread, name, has_offset = np.zeros(0), "", False
+        if variant is not None:
+            spread, name, has_offset = self._spread(variant, power), variant.name, variant.offset
+        scale, centre = np.concatenate([[np.inf], self.prior, spread]), np.zeros(len(products))
+        centre[1 : 1 + len(self.free)] = -self.theta
+        return Products(products, len(self.free), has_offset, scale, centre, self._twins(name))
 
-        jobs = [(signals, Forces(columns_of(group, signals))) for signals in self.signals for group in groups]
-        total, power = np.zeros((end, end)), np.zeros(end)
-        first = shared
-        for gram, squares in map_in_threads(products, *zip(*jobs, strict=True)):
-            last = first + len(squares)
-            index = np.array([*range(shared), *range(first, last)])
-            if first > shared:
-                # what all candidates of a part share counts once
-                gram[:shared, :shared] = 0.0
-            total[np.ix_(index, index)] += gram
-            power[first:last] += squares
-            first = last if last < end else shared
+    def _spread(self, variant: Candidate, power: np.ndarray) -> np.ndarray:
+        """Prior standard deviation of each coefficient of a candidate, and of what is there without."""
+        if variant.spread:
+            return np.full(len(power), variant.spread)
         with np.errstate(divide="ignore"):
             # what has no torque along this motion cannot be found
-            size = LIMITS.effect_size * self.drive / np.sqrt(power[shared:] / self.count)
-        scale = np.concatenate([[np.inf], self.prior, size])
-        for variant, place in zip(variants, map(list, places), strict=True):
-            if variant.offset or variant.spread:
-                scale[place] = variant.spread or SPACING
-            elif (nominal := self.nominal(variant.name)) is not None:
-                scale[place] = np.minimum(scale[place], LIMITS.number_error * nominal)
-        centre = np.zeros(end)
-        centre[1:shared] = -self.theta
-        return Products(total, len(self.free), tuple(places), tuple(offsets), scale, centre, self._twins(variants, places))
+            size = LIMITS.effect_size * self.drive / np.sqrt(power / self.count)
+        nominal = self.nominal(variant.name)
+        return size if nominal is None else np.minimum(size, LIMITS.number_error * nominal)
 
-    def _twins(self, variants: Sequence[Candidate], places: Sequence[tuple[int, ...]]) -> dict[int, tuple[int, float]]:
+    def _twins(self, candidate: str) -> dict[int, tuple[int, float]]:
         """Columns that are those of other numbers: the error of a number that is free acts as that number does."""
-        slopes = [float(number.slope(self.theta[i])) for i, number in enumerate(self.free)]
-        twins = {}
-        for variant, place in zip(variants, places, strict=True):
-            if (i := self.same(variant.name)) is not None:
-                twins[place[0]] = 1 + i, 1.0 / slopes[i]
-        for j, number in enumerate(self.free):
-            name, _, leaf = number.path.removeprefix("effects.").rpartition(".")
-            if leaf and (i := self.same(name)) is not None:
-                twins[1 + j] = 1 + i, slopes[j] / slopes[i]
-        return twins
+        slopes = [*(float(number.slope(now)) for number, now in zip(self.free, self.theta, strict=True)), 1.0]
+        owners = [*(owner_of(number)[0] for number in self.free), candidate]
+        return {1 + k: (1 + i, slopes[k] / slopes[i]) for k, name in enumerate(owners) if (i := self.same(name)) is not None}
 
     def _power(self, torques: Forces, signals: MotionTorques) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
@@ -537,13 +525,12 @@ class Linear:
         """Standard deviations by which the prediction errors show the input; infinite where the record has none."""
         if not self.driven:
             return np.inf
-        predictor = self.choose(())
         # the torque of the input once more
         again = Candidate(
             "input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]}, lambda values: {}
         )
-        products = self.columns([again], predictor.smoothness, predictor.deviation).products
-        return float(np.sqrt(products[-1, -1]))
+        _, with_input = self.products([again], self.chosen.smoothness, self.chosen.deviation)
+        return float(np.sqrt(with_input.products[-1, -1]))
 
     def shows(self, name: str, numbers: Numbers) -> bool:
         """Tell whether the log can show an effect with these numbers: a gap three times as wide as any twist, or contacts
@@ -577,19 +564,14 @@ class Linear:
 
 
 def _peaks(
-    waves: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, apart: float
+    waves: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, distance: float
 ) -> list[float]:
-    """Waves at which a score, over the power that noise gives it (known at a `few`), has its highest peaks."""
+    """Waves at which a score, over the power that noise gives it (known at a `few`), has its highest peaks; `distance`
+    between two of them, in waves. Neither the first nor the last wave is `inside`."""
     expected = np.exp(np.interp(np.log(np.maximum(waves, 1e-9)), np.log(few), np.log(np.maximum(power, 1e-300))))
-    score = np.concatenate([[0.0], np.where(inside, score / expected, 0.0), [0.0]])
-    peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:]))
-    peaks_found: list[float] = []
-    for k in peaks[np.argsort(-score[1:-1][peaks])]:
-        if all(abs(waves[k] - peak) > apart for peak in peaks_found):
-            peaks_found.append(float(waves[k]))
-        if len(peaks_found) == _FREQUENCIES:
-            break
-    return peaks_found
+    score = np.where(inside, score / expected, 0.0)
+    peaks, _ = find_peaks(score, distance=distance)
+    return waves[peaks[np.argsort(-score[peaks])][:_FREQUENCIES]].tolist()
 
 
 def find_gains(smoothness: Sequence[float], period: float) -> np.ndarray:

@@ -21,14 +21,14 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
 from .blocks import standard_errors_better
-from .candidates import ZERO_SPREAD
+from .candidates import ZERO_SPREAD, owner_of
 from .choice import Chosen
 from .expected_errors import Expected, expected_errors, list_failed
 from .fitted_model import FittedModel
 from .linearised_model import find_driving_torque
 from .neutral_effects import without
 from .reference_log import Comparison, Errors, ReferenceLog
-from .refit import ModelFits, owner_of
+from .refit import ModelFits
 from .setup import Setup, quiet
 from .thresholds import LIMITS
 

@@ -28,7 +28,7 @@ from jaxbl.fused.single_plant import simulate_plant
 from jaxbl.records.least_squares import BlockRegression
 
 from .blocks import QUARTERS
-from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law
+from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law, owner_of
 from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
 from .linearised_model import SILENT, Linear, Predictor, find_gains
 from .neutral_effects import complete, lean
@@ -204,7 +204,7 @@ class _Fit:
             near = best.linear.choose((), best.predictor.smoothness).smoothness
             # along the smoothed motion what is chosen does not hang on what was chosen before
             first = [self._choose(best.theta)] if turn == 0 else []
-            options = [*first, best.linear.choose(()).smoothness, near]
+            options = [*first, best.linear.chosen.smoothness, near]
             points = [
                 self.at(best.theta, best.start, smoothness)
                 for i, smoothness in enumerate(options)
@@ -222,7 +222,7 @@ class _Fit:
 
     def _choose(self, theta: np.ndarray) -> Sequence[float]:
         """Choose the predictor along the smoothed motion."""
-        return Linear(self.experiment, self.free, theta, self.width, self.segments).choose(()).smoothness
+        return Linear(self.experiment, self.free, theta, self.width, self.segments).chosen.smoothness
 
     def _descend(self, best: _Point) -> _Point:
         share = 1.0
@@ -374,12 +374,6 @@ def paths_of(names: Sequence[str] | EffectNumbers) -> list[str]:
         for leaf, role in EFFECTS[name].roles().items()
         if role.kind not in ("harmonic", "held")
     ]
-
-
-def owner_of(number: FreeParameter) -> tuple[str, str]:
-    """Return the effect that a number is of, and its name there."""
-    name, _, leaf = number.path.removeprefix("effects.").rpartition(".")
-    return name, leaf
 
 
 def with_numbers(experiment: Experiment, values: EffectNumbers) -> Experiment:

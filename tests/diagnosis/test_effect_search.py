@@ -171,9 +171,9 @@ def test_numbers_that_are_all_off_are_no_effect(tmp_path):
 def test_a_free_function_without_a_solution_shows_nothing(monkeypatch):
     # no products of real columns: rounding made these of a function that is all but a number of the model
     alike = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1e9], [0.0, 1e9, 1.0]])
-    columns = Products(alike, 1, ((2,),), (-1,), np.ones(3), np.zeros(3))
+    models = [Products(alike[:count, :count], 1, False, np.ones(count), np.zeros(count)) for count in (2, 3)]
     predictor = SimpleNamespace(smoothness=[1.0], deviation=np.ones(1))
-    linear = SimpleNamespace(choose=lambda _: predictor, columns=lambda *_: columns, signals=[])
+    linear = SimpleNamespace(chosen=predictor, products=lambda *_: models, signals=[])
     monkeypatch.setattr(effect_search, "functions_of", lambda _: [SimpleNamespace(name="motor.time")])
     search = SimpleNamespace(floor=0.0)
     assert EffectSearch.remainder(search, SimpleNamespace(linear=linear)) == {"motor.time": (-np.inf, 0.0)}  # type: ignore

@@ -173,9 +173,9 @@ def test_numbers_of_waves_are_those_of_the_effect(geared_model):
 def test_products_are_those_of_the_errors(sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
     model = linearise(sides)
-    products = model.columns((), [1e-6] * sides, np.ones(sides)).products
+    (alone,) = model.products((), [1e-6] * sides, np.ones(sides))
     columns = prediction_errors(model)
-    assert products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(products))
+    assert alone.products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(alone.products))
 
 
 def test_products_of_candidates_are_those_of_their_errors(geared_model):
@@ -184,17 +184,18 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     variants = variants_of(model.experiment, list(SMALL_NUMBERS), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = np.array([2e-5, 3e-5])
-    columns = model.columns(variants, smoothness, noise)
-    assert len(columns.products) > model_columns + 2 * module._TOGETHER
+    alone, *with_candidates = model.products(variants, smoothness, noise)
+    assert sum(variant.width for variant in variants) > 2 * module._TOGETHER
     forces = Forces(columns_of(variants, model.signals[0]))
     predicted = module._errors(model.parts[0], find_gains(smoothness, model.period), forces)
     gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
     expected = module._eliminate(gram, model.states)
     size = np.sqrt(np.diag(expected))
-    for places, offset in zip(columns.places, columns.offsets, strict=True):
-        point = np.array([*range(model_columns), *places, *([offset] if offset >= 0 else [])])
-        grid = np.ix_(point, point)
-        difference = (columns.products[grid] - expected[grid]) / np.outer(size[point], size[point])
+    begin = end = model_columns
+    for variant, products in zip([None, *variants], [alone, *with_candidates], strict=True):
+        begin, end = end, end + (0 if variant is None else variant.width + variant.offset)
+        point = np.array([*range(model_columns), *range(begin, end)])
+        difference = (products.products - expected[np.ix_(point, point)]) / np.outer(size[point], size[point])
         assert np.max(np.abs(difference), where=np.isfinite(difference), initial=0.0) < 1e-9
 
 
@@ -252,7 +253,7 @@ def test_what_rounding_takes_is_known(growth):
 
 def test_a_gain_under_which_rounding_would_decide_is_left_out(monkeypatch):
     model = linearise(1)
-    smoothness = model.choose(()).smoothness
+    smoothness = model.chosen.smoothness
     assert np.isfinite(model.predictor(smoothness).squares).all()
     monkeypatch.setattr(module, "_LOST", 0.0)
     assert not np.isfinite(model.predictor(smoothness).squares).any()

@@ -18,7 +18,6 @@ def regress(folder, *effects):
         search = Choice(set_up(task)).search
         nominal = search.fits.fit({}, np.zeros(len(search.fits.prior)))
         linear = search.fits.given
-        linear.choose(())
         regression = search._regress(linear, nominal, variants_of(search.fits.nominal, search.lacking, linear.scales))
         return regression.propose(), regression.propose_together()
 
