@@ -88,6 +88,9 @@ class Candidate:
     spread: float = 0.0
 
 
+NO_CANDIDATE = Candidate("", 0, (), lambda signals, torques: {}, lambda values: {})
+
+
 def owner_of(number: FreeParameter) -> tuple[str, str]:
     """Return the effect that a number is of, and its name there."""
     name, _, leaf = number.path.removeprefix("effects.").rpartition(".")
@@ -224,7 +227,7 @@ class Forces:
     def __init__(self, columns: Sequence[Torques]):
         """Put columns beside one another."""
         self.width, self.runs = 0, list[tuple[int, slice, np.ndarray]]()
-        for places, alike in itertools.groupby(columns, key=tuple):
+        for places, alike in itertools.groupby(filter(None, columns), key=tuple):
             pieces = list(alike)
             joined = {place: np.concatenate([np.atleast_2d(piece[place]) for piece in pieces]) for place in places}
             here = slice(self.width, self.width + len(joined[places[0]]))

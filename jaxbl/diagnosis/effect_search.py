@@ -10,7 +10,6 @@ one that gains clearly says that something else is missing. What is less likely 
 again (:mod:`.choice`).
 """
 
-import dataclasses
 from collections.abc import Callable, Collection, Sequence
 from typing import Literal, NamedTuple
 
@@ -532,9 +531,10 @@ class EffectSearch:
         base = evidence_of(alone)
         assert base is not None
         best: dict[str, _Proposal] = {}
-        for variant, products in zip(variants, models, strict=True):
+        for columns in models:
+            variant = columns.candidate
             gone = [name for name in names if name == variant.name or replaces(variant.name, name)]
-            evidence = evidence_of(_without(products, linear, gone), variant)
+            evidence = evidence_of(_without(columns, linear, gone))
             if evidence is not None:
                 nats = self._nats(linear, base, evidence) - linear.choices(variant.name)
                 if nats > (best[variant.name].nats if variant.name in best else least):
@@ -552,20 +552,20 @@ class EffectSearch:
     def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
         """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
         linear = fitted.linear
-        functions, gained = functions_of(linear.signals), {}
-        alone, *models = linear.products(functions, linear.chosen.smoothness, linear.chosen.deviation)
+        functions, predictor, gained = functions_of(linear.signals), linear.chosen, {}
+        alone, *models = linear.products(functions, predictor.smoothness, predictor.deviation)
         none = evidence_of(alone)
-        for function, columns in zip(functions, models, strict=True):
+        for columns in models:
             best = (-np.inf, 0.0)
             for size in _SIZES:
                 scale = columns.scale.copy()
-                scale[1 + columns.own_count :] *= size
-                with_function = evidence_of(dataclasses.replace(columns, scale=scale), function)
+                scale[columns.shared :] *= size
+                with_function = evidence_of(columns._replace(scale=scale))
                 # columns that are all but alike may have no solution
                 if none is not None and with_function is not None:
                     nats = self._nats(linear, none, with_function)
                     best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
-            gained[function.name] = best
+            gained[columns.candidate.name] = best
         return gained
 
 
@@ -589,4 +589,4 @@ def _without(columns: Products, linear: Linear, names: Collection[str]) -> Produ
             change[0, k] = -float(number.value(theta)) / float(number.slope(theta))
     scale = columns.scale.copy()
     scale[gone] = np.inf
-    return dataclasses.replace(columns, products=change @ columns.products @ change.T, scale=scale)
+    return columns._replace(products=change @ columns.products @ change.T, scale=scale)

@@ -7,8 +7,7 @@ References: D. MacKay, Bayesian interpolation, Neural Computation 4 (1992); R. K
 Statistical Association 90 (1995).
 """
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,27 +16,29 @@ from scipy.linalg import solve_triangular
 from .candidates import Candidate, Numbers
 
 
-@dataclasses.dataclass(frozen=True)
-class Products:
-    """Everything that prediction errors are linear in, as products.
+class Products(NamedTuple):
+    """Everything that the prediction errors of a model with a candidate are linear in, as products.
 
     Attributes:
+        candidate: what is added to the model.
         products: of all columns with one another, over the errors' variance, initial states eliminated; shape
-            (columns, columns). Order: constant, own numbers, then a candidate's columns, and what is there without them.
-        own_count: number of the model's own numbers.
-        has_offset: whether the last column is there whatever the candidate's coefficients are.
+            (columns, columns). Order: constant, own numbers, the candidate's columns, and what is there without them.
         scale: prior standard deviation of each column's coefficient; infinite where it does nothing along this record.
         centre: prior mean of each.
         twins: columns that are a multiple of one of the model's own, which is always there: that one, and the factor. Only
             their priors part the two, so that these are joined: the data's precision may be too large for them to be seen.
     """
 
+    candidate: Candidate
     products: np.ndarray
-    own_count: int
-    has_offset: bool
     scale: np.ndarray
     centre: np.ndarray
-    twins: Mapping[int, tuple[int, float]] = dataclasses.field(default_factory=dict)
+    twins: Mapping[int, tuple[int, float]]
+
+    @property
+    def shared(self) -> int:
+        """Number of columns that are there without a candidate."""
+        return len(self.scale) - self.candidate.width - self.candidate.offset
 
 
 class Evidence(NamedTuple):
@@ -56,20 +57,20 @@ class Evidence(NamedTuple):
     own_change: np.ndarray
 
 
-def evidence_of(columns: Products, candidate: Candidate | None = None) -> Evidence | None:
-    """Evidence of a model with a candidate, or without any; None where the numbers are not allowed.
+def evidence_of(columns: Products) -> Evidence | None:
+    """Evidence of a model with its candidate; None where the numbers are not allowed.
 
     A candidate that is linear about a value that was tried is left at this value where it would have to go too far.
     """
-    places = range(1 + columns.own_count, len(columns.products) - columns.has_offset)
-    evidence = _evidence(columns, places, candidate)
-    return _evidence(columns, (), candidate) if evidence is None and columns.has_offset else evidence
+    evidence = _evidence(columns, columns.candidate.width)
+    return _evidence(columns, 0) if evidence is None and columns.candidate.offset else evidence
 
 
-def _evidence(c: Products, places: Sequence[int], candidate: Candidate | None) -> Evidence | None:
-    fixed = np.array([0, -1] if c.has_offset else [0])
+def _evidence(c: Products, width: int) -> Evidence | None:
+    """The same with so many of the candidate's columns."""
+    fixed = np.array([0, -1] if c.candidate.offset else [0])
     # what has no torque along this record has no coefficient either
-    alive = [k for k in (*range(1, 1 + c.own_count), *places) if np.isfinite(c.scale[k])]
+    alive = [k for k in range(1, c.shared + width) if np.isfinite(c.scale[k])]
     variance, middle = c.scale**2, c.centre.copy()
     joined = [k for k in alive if k in c.twins]
     for k in joined:
@@ -88,8 +89,8 @@ def _evidence(c: Products, places: Sequence[int], candidate: Candidate | None) -
         of, factor = c.twins[k]
         values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
         values[of] -= factor * values[k]
-    numbers = {} if candidate is None else candidate.numbers(values[list(places)].tolist() if places else [0.0])
-    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : 1 + c.own_count])
+    numbers = c.candidate.numbers(values[c.shared : c.shared + c.candidate.width].tolist())
+    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : c.shared])
 
 
 def _solve(

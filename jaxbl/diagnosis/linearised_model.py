@@ -42,7 +42,7 @@ from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.records.least_squares import rms
 from jaxbl.workers import map_in_threads
 
-from .candidates import REACH, Candidate, Forces, MotionTorques, Part, columns_of, owner_of
+from .candidates import NO_CANDIDATE, REACH, Candidate, Forces, MotionTorques, Part, columns_of, owner_of
 from .evidence import Products
 from .neutral_effects import bucket, find_corrected, lean, with_torques
 from .thresholds import LIMITS
@@ -470,7 +470,7 @@ class Linear:
     def products(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> list[Products]:
         """Products of everything that the prediction errors are linear in, initial states eliminated: of the model alone,
         and then with each candidate; `noise`: rms of the errors by side, rad."""
-        gain, groups = find_gains(smoothness, self.period), _groups(variants)
+        gain, groups = find_gains(smoothness, self.period), _groups([NO_CANDIDATE, *variants])
         forces_of_all = [[Forces(columns_of(group, signals)) for signals in self.signals] for group in groups]
 
         def multiply(forces: list[Forces]) -> tuple[np.ndarray, np.ndarray]:
@@ -482,23 +482,15 @@ class Linear:
         # the constant and the own numbers come first
         shared, models = 1 + len(self.free), list[Products]()
         for group, (gram, power) in zip(groups, map_in_threads(multiply, forces_of_all), strict=True):
-            if not models:
-                models.append(self._products_of(None, gram[:shared, :shared], power))
             end = shared
             for variant in group:
                 begin, end = end, end + variant.width + variant.offset
                 rows = [*range(shared), *range(begin, end)]
-                models.append(self._products_of(variant, gram[np.ix_(rows, rows)], power[begin - shared : end - shared]))
+                spread = self._spread(variant, power[begin - shared : end - shared])
+                scale, centre = np.concatenate([[np.inf], self.prior, spread]), np.zeros(len(rows))
+                centre[1:shared] = -self.theta
+                models.append(Products(variant, gram[np.ix_(rows, rows)], scale, centre, self._twins(variant.name)))
         return models
-
-    def _products_of(self, variant: Candidate | None, products: np.ndarray, power: np.ndarray) -> Products:
-        """Add what is known of the coefficients; `power`: sums of squares of a candidate's torques."""
-        spread, name, has_offset = np.zeros(0), "", False
-        if variant is not None:
-            spread, name, has_offset = self._spread(variant, power), variant.name, variant.offset
-        scale, centre = np.concatenate([[np.inf], self.prior, spread]), np.zeros(len(products))
-        centre[1 : 1 + len(self.free)] = -self.theta
-        return Products(products, len(self.free), has_offset, scale, centre, self._twins(name))
 
     def _spread(self, variant: Candidate, power: np.ndarray) -> np.ndarray:
         """Prior standard deviation of each coefficient of a candidate, and of what is there without."""

@@ -11,6 +11,7 @@ from hidden.cases import cases
 from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_log
 
 from jaxbl.diagnosis import effect_search
+from jaxbl.diagnosis.candidates import NO_CANDIDATE, Candidate
 from jaxbl.diagnosis.confidence import weigh
 from jaxbl.diagnosis.effect_search import EffectSearch
 from jaxbl.diagnosis.evidence import Products
@@ -171,9 +172,13 @@ def test_numbers_that_are_all_off_are_no_effect(tmp_path):
 def test_a_free_function_without_a_solution_shows_nothing(monkeypatch):
     # no products of real columns: rounding made these of a function that is all but a number of the model
     alike = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1e9], [0.0, 1e9, 1.0]])
-    models = [Products(alike[:count, :count], 1, False, np.ones(count), np.zeros(count)) for count in (2, 3)]
+    function = Candidate("motor.time", 1, (), lambda signals, torques: {}, lambda values: {})
+    models = [
+        Products(candidate, alike[:count, :count], np.ones(count), np.zeros(count), {})
+        for candidate, count in ((NO_CANDIDATE, 2), (function, 3))
+    ]
     predictor = SimpleNamespace(smoothness=[1.0], deviation=np.ones(1))
     linear = SimpleNamespace(chosen=predictor, products=lambda *_: models, signals=[])
-    monkeypatch.setattr(effect_search, "functions_of", lambda _: [SimpleNamespace(name="motor.time")])
+    monkeypatch.setattr(effect_search, "functions_of", lambda _: [function])
     search = SimpleNamespace(floor=0.0)
     assert EffectSearch.remainder(search, SimpleNamespace(linear=linear)) == {"motor.time": (-np.inf, 0.0)}  # type: ignore

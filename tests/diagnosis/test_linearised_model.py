@@ -184,7 +184,7 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     variants = variants_of(model.experiment, list(SMALL_NUMBERS), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = np.array([2e-5, 3e-5])
-    alone, *with_candidates = model.products(variants, smoothness, noise)
+    models = model.products(variants, smoothness, noise)
     assert sum(variant.width for variant in variants) > 2 * module._TOGETHER
     forces = Forces(columns_of(variants, model.signals[0]))
     predicted = module._errors(model.parts[0], find_gains(smoothness, model.period), forces)
@@ -192,8 +192,9 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     expected = module._eliminate(gram, model.states)
     size = np.sqrt(np.diag(expected))
     begin = end = model_columns
-    for variant, products in zip([None, *variants], [alone, *with_candidates], strict=True):
-        begin, end = end, end + (0 if variant is None else variant.width + variant.offset)
+    assert [products.candidate for products in models[1:]] == variants
+    for products in models:
+        begin, end = end, end + len(products.scale) - products.shared
         point = np.array([*range(model_columns), *range(begin, end)])
         difference = (products.products - expected[np.ix_(point, point)]) / np.outer(size[point], size[point])
         assert np.max(np.abs(difference), where=np.isfinite(difference), initial=0.0) < 1e-9
