@@ -17,12 +17,13 @@ from functools import lru_cache
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool
 
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Motion, Numbers, Scales, make_effect
 from jaxbl.estimation.free_parameters import FreeParameter
-from jaxbl.estimation.regression import Path, Samples, SideSamples, effect_path, remembers_input
+from jaxbl.estimation.regression import Path, SideSamples, effect_path, remembers_input
+from jaxbl.estimation.segments import Segment
 from jaxbl.fused.compilation import jit
 
 EffectNumbers = Mapping[str, Numbers]
@@ -30,31 +31,20 @@ EffectNumbers = Mapping[str, Numbers]
 
 
 class Part(Path):
-    """A part of a record without gaps, and the model along it; its torque is held from each sample to the next.
+    """Motion along a part of a record without gaps, and of the model there; its torque is held from each sample to the next.
+    Behind the last sample there is filling, so that parts of about one length share their compiled programs.
 
     Attributes:
         position, velocity, acceleration: smoothed, of each side.
-        readings: position over its smoothed value, rad, shape (samples, sides).
         modelled: mean acceleration over the next period by the model, of each side: free of the readings' noise.
         deviation: standard deviation of the smoothed velocity, of each side.
-        held: 1 where a side is not shown to move for a while, else 0.
-        step: A, shape (samples, states, states).
-        force: B, by torque on each side and by the input, shape (samples, states, sides + 1).
-        by_number: change of a step by each free number (theta), padded with zeros, shape (samples, states, numbers).
-        defect: model's step less the smoothed one, shape (samples, states).
-        weight: 1, or 0 where samples are padding.
+        held: whether a side is not shown to move for a while.
     """
 
     acceleration: SideSamples
-    readings: Float[Array, "samples sides"]
     modelled: SideSamples
     deviation: SideSamples
-    held: SideSamples
-    step: Float[Array, "samples states states"]
-    force: Float[Array, "samples states inputs"]
-    by_number: Float[Array, "samples states numbers"]
-    defect: Float[Array, "samples states"]
-    weight: Samples
+    held: dict[str, Bool[Array, " samples"]]
 
 
 Torques = dict[int, np.ndarray]
@@ -262,17 +252,11 @@ class Forces:
 class MotionTorques:
     """Torques of effects along one part of a record."""
 
-    def __init__(self, experiment: Experiment, part: Part, shared: dict[tuple, Torques]):
-        """Prepare to ask for torques; `shared` keeps those that are the same for all models along the part."""
-        self.experiment, self.part, self.shared = experiment, part, shared
-        self.sides = experiment.sides
-        self.real = part.weight > 0.0
-        # what is behind them only fills up
-        self.samples = int(np.sum(self.real))
-        # what torques along the motion need, of one shape whatever numbers are free
-        self.moving = dataclasses.replace(part, step=None, force=None, by_number=None, defect=None)
-        self.held = {side: (part.held[side] > 0.0) & self.real for side in self.sides}
-        needed = _find_needed(experiment, self.moving) if any(samples.any() for samples in self.held.values()) else None
+    def __init__(self, experiment: Experiment, part: Part, segment: Segment):
+        """Prepare to ask for torques along a segment, which keeps those that are the same for all models."""
+        self.experiment, self.part, self.segment = experiment, part, segment
+        self.sides, self.samples = experiment.sides, len(segment)
+        needed = _find_needed(experiment, part) if any(samples.any() for samples in part.held.values()) else None
         self.direction = {side: self._direction(side, needed) for side in self.sides}
         self.known: dict[Candidate, Torques] = {}
 
@@ -286,7 +270,7 @@ class MotionTorques:
         with np.errstate(over="ignore"):
             passage = np.clip(velocity / np.maximum(step, deviation), -1.0, 1.0)
         moving = passage * (2.0 - np.abs(passage))
-        held = self.held[side]
+        held = self.part.held[side]
         if needed is None or not held.any():
             return moving
         # a side that is held takes what it needs, up to the level
@@ -300,7 +284,7 @@ class MotionTorques:
         torques_of: list[Torques] = [{}] * len(effects)
         asked: dict[str, list[int]] = {}
         for i, effect in enumerate(effects):
-            stored = self.shared.get(_key(effect, from_rest)) if self._shares(effect) else None
+            stored = self.segment.torques.get(_key(effect, from_rest)) if self._shares(effect) else None
             if stored is None:
                 asked.setdefault(effect.name, []).append(i)
             else:
@@ -324,12 +308,12 @@ class MotionTorques:
                 spare = [effects[batch[-1]]] * (_AT_ONCE - len(batch))
                 members = (*(effects[i] for i in batch), *spare)
                 stack = jax.tree.map(lambda *x: np.array([float(leaf) for leaf in x]), *members)
-                torques = _torques(bare, stack, self.moving, direction, from_rest)
+                torques = _torques(bare, stack, self.part, direction, from_rest)
                 rows = {side: np.asarray(torque)[:, : self.samples] for side, torque in torques.items()}
                 for k, i in enumerate(batch):
                     torques_of[i] = {side: torque[k] for side, torque in rows.items()}
                     if self._shares(effects[i]):
-                        self.shared[_key(effects[i], from_rest)] = torques_of[i]
+                        self.segment.torques[_key(effects[i], from_rest)] = torques_of[i]
         return torques_of
 
     def _shares(self, effect: AbstractEffect) -> bool:
@@ -338,7 +322,7 @@ class MotionTorques:
         place, kind = self.experiment.drive.resolve_place(effect.place), type(effect)
         if place == "actuator":
             return True
-        held = place in self.held and self.held[place].any()
+        held = place in self.sides and self.part.held[place].any()
         return place != "transmission" and not any(
             getattr(kind, hook) is not getattr(AbstractEffect, hook)
             for hook in ("added_inertia", *(("dry_friction", "holds") if held else ()))
@@ -393,7 +377,7 @@ def _torques(
         motion = Motion(part.time, part.position[place], part.velocity[place], driving)
         resisting = effect.resist(state, motion)
         if type(effect).holds is not AbstractEffect.holds:
-            resisting = jnp.where(part.held[place] > 0.0, effect.holds() * direction, resisting)
+            resisting = jnp.where(part.held[place], effect.holds() * direction, resisting)
         resisting = resisting + effect.dry_friction(state, motion) * direction
         resisting = resisting + effect.added_inertia() * part.modelled[place]
         return {sides.index(place): -resisting}

@@ -29,7 +29,7 @@ def functions_of(signals: Sequence[MotionTorques]) -> list[Candidate]:
     functions = []
     for side in signals[0].sides:
         for kind, (name, knots, friction) in _FUNCTIONS.items():
-            along = np.concatenate([_coordinate(part, name, side)[part.real] for part in signals])
+            along = np.concatenate([_coordinate(part, name, side) for part in signals])
             span = float(along.min()), float(along.max())
             hats = partial(_make_hats, name, side, span, knots, friction)
             functions.append(_candidate(side, kind, knots, hats))
@@ -41,14 +41,14 @@ def _candidate(side: str, kind: str, width: int, shape: Callable[[MotionTorques]
     """A torque on a side that is a sum of columns, shape (samples, width), each of height 1."""
 
     def columns(signals: MotionTorques, _: Sequence[Torques]) -> Torques:
-        return {signals.sides.index(side): -shape(signals)[: signals.samples].T}
+        return {signals.sides.index(side): -shape(signals).T}
 
     return Candidate(f"{side}.{kind}", width, (), columns, lambda values: {})
 
 
 def _coordinate(signals: MotionTorques, name: str, side: str) -> np.ndarray:
     values = getattr(signals.part, name)
-    return np.asarray(values[side] if isinstance(values, dict) else values)
+    return (values[side] if isinstance(values, dict) else values)[: signals.samples]
 
 
 def _make_hats(
@@ -58,13 +58,13 @@ def _make_hats(
     low, high = span
     index = (_coordinate(part, name, side) - low) / max(high - low, 1e-300) * (count - 1)
     heights = np.maximum(1.0 - np.abs(index[:, None] - np.arange(count)[None, :]), 0.0)
-    return heights * part.direction[side][:, None] if friction else heights
+    return heights * part.direction[side][: part.samples, None] if friction else heights
 
 
 def _make_stops(side: str, part: MotionTorques) -> np.ndarray:
     """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
     position = _coordinate(part, "position", side)
-    lengths = np.maximum(np.array(_LENGTHS) * np.std(position[part.real]), 1e-300)
+    lengths = np.maximum(np.array(_LENGTHS) * np.std(position), 1e-300)
     way = np.diff(position, prepend=position[0])
     (columns,) = scan_signal(_advance_stop, [lengths], [0.0 * lengths], [way])
     return columns

@@ -18,7 +18,7 @@ Automatica 24 (1988), for the local approach.
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -34,10 +34,9 @@ from jaxbl.estimation.free_parameters import FreeParameter, set_free_parameters
 from jaxbl.estimation.prediction import kalman_gain
 from jaxbl.estimation.regression import Path, effect_states
 from jaxbl.estimation.segments import Segment, reading_noise
-from jaxbl.fused import Arrays, Leaves
+from jaxbl.fused import Arrays
 from jaxbl.fused.compilation import jit
 from jaxbl.fused.linear_predictor import LinearPredictor
-from jaxbl.fused.signal_scan import scan_signal
 from jaxbl.fused.single_plant import Direction, step_derivatives
 from jaxbl.records.least_squares import rms
 from jaxbl.workers import map_in_threads
@@ -51,7 +50,74 @@ _SAMPLES = 1024
 """Least padded length of a part, so that records of about one length share their compiled programs."""
 
 
-def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, segment: Segment) -> Part:
+class _Steps(NamedTuple):
+    """A model's steps along a part of a record, linear in everything that may change.
+
+    Attributes:
+        step: A, shape (samples, states, states).
+        force: B, by torque on each side and by the input, shape (samples, states, sides + 1).
+        by_number: change of a step by each free number (theta), shape (samples, states, numbers).
+        defect: model's step less the smoothed one, shape (samples, states).
+        readings: position over its smoothed value, rad, shape (samples, sides).
+    """
+
+    step: np.ndarray
+    force: np.ndarray
+    by_number: np.ndarray
+    defect: np.ndarray
+    readings: np.ndarray
+
+    def _errors_along(self, gains: Sequence[np.ndarray], forces: Forces) -> Iterator[Arrays]:
+        """Prediction errors under each gain, rad, some samples after the others; shape (sides, samples, columns). Columns:
+        constant, own numbers, forces, initial states."""
+        count, states = self.defect.shape
+        own_width = 1 + self.by_number.shape[2]
+        width = own_width + forces.width + states
+        recursion = LinearPredictor.of(states, self.readings.shape[1], width)
+        begun = np.zeros((states, width))
+        begun[:, -states:] = np.eye(states)
+        changes = [begun] * len(gains)
+        length = max(_VALUES // width, 64)
+        for first in range(0, count, length):
+            rows = slice(first, min(first + length, count))
+            driven = np.zeros((states, rows.stop - first, width))
+            driven[:, :, 0] = self.defect[rows].T
+            driven[:, :, 1:own_width] = self.by_number[rows].transpose(1, 0, 2)
+            driven[:, :, own_width:-states] = forces.driving(self.force[rows], rows)
+            changes, errors = recursion(changes, gains, self.step[rows], driven, self.readings[rows])
+            yield errors
+
+    def errors(self, gain: np.ndarray, forces: Forces) -> np.ndarray:
+        """All prediction errors under a gain, rad, shape (samples, sides, columns)."""
+        return np.concatenate([errors.transpose(1, 0, 2) for (errors,) in self._errors_along([gain], forces)])
+
+    def grams(self, gains: Sequence[np.ndarray], forces: Forces) -> np.ndarray:
+        """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
+        shape (gains, sides, columns, columns)."""
+        total = np.zeros(())
+        # of a gain under which errors diverge
+        with np.errstate(invalid="ignore", over="ignore"):
+            for errors_by_gain in self._errors_along(gains, forces):
+                total = total + [np.matmul(errors.transpose(0, 2, 1), errors) for errors in errors_by_gain]
+        return total
+
+    def gradient(self, gain: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Derivative of the sum of products of errors with `left` by the torque at each sample, shape
+        (samples, sides + 1)."""
+        sides, adjoints = left.shape[1], np.zeros_like(self.defect)
+        # nothing of the gain is on the effects' own states
+        gains = np.zeros((self.defect.shape[1], sides))
+        gains[: 2 * sides] = np.concatenate([np.diag(column) for column in gain.T])
+        for k in range(len(left) - 1, 0, -1):
+            adjoint = adjoints[k] @ self.step[k]
+            adjoint[:sides] -= adjoint @ gains + left[k]
+            adjoints[k - 1] = adjoint
+        return np.einsum("tij,ti->tj", self.force, adjoints)
+
+
+def _linearise(
+    experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarray, segment: Segment
+) -> tuple[Part, _Steps]:
     """A model along a segment, where its free numbers are at theta."""
     sides, smoothed = experiment.sides, segment.smoothed
     experiment, added = with_torques(experiment)
@@ -64,8 +130,8 @@ def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarr
     states = {side: pad(smoothed[side].state) for side in sides}
     deviation = {side: pad(smoothed[side].deviation(1)) for side in sides}
     period = float(experiment.run.sample_period)
-    held = {side: pad(smoothed[side].find_standstill(period).astype(float)) for side in sides}
-    read = np.stack([pad(segment.readings[side]) - states[side][:, 0] for side in sides], axis=1)
+    held = {side: np.pad(smoothed[side].find_standstill(period), (0, size - count)) for side in sides}
+    read = np.stack([segment.readings[side] - smoothed[side].state[:, 0] for side in sides], axis=1)
     time, torque = pad(segment.time), pad(segment.torque)
     position, velocity, acceleration = ({side: states[side][:, i] for side in sides} for i in range(3))
     effects = effect_states(experiment, Path(time, torque, position, velocity, before=segment.before))
@@ -88,98 +154,17 @@ def _part(experiment: Experiment, free: Sequence[FreeParameter], theta: np.ndarr
         *(Direction({number.path: float(number.slope(now))}) for number, now in zip(free, theta, strict=True)),
     ]
     slope, value = step_derivatives(experiment, motion, torque, time, ways)
-    slope, value = slope[:, order].transpose(2, 1, 0), value[order].T
+    slope, value = slope[:, order, :count].transpose(2, 1, 0), value[order].T
     vectors = np.stack(jax.tree.leaves(motion), axis=1)[:, order]
-    defect = np.zeros_like(value)
+    defect = np.zeros((count, len(order)))
     # a path along which a model diverges has nothing finite
     with np.errstate(invalid="ignore", over="ignore"):
         modelled = {side: (value[:, side_count + i] - vectors[:, side_count + i]) / period for i, side in enumerate(sides)}
         # nothing happens from the last reading on
-        defect[: count - 1] = value[: count - 1] - vectors[1:count]
-    a, b, by_number = np.split(slope, (len(order), len(order) + side_count + 1), axis=2)
-    weight = (np.arange(size) < count).astype(float)
-    return Part(
-        time, torque, position, velocity, acceleration, read, modelled, deviation, held, a, b, by_number, defect, weight,
-        before=segment.before,
-    )  # fmt: skip
-
-
-class _Columns:
-    """Everything that the prediction errors along a part are linear in; columns: constant, own numbers, forces, initial
-    states."""
-
-    def __init__(self, part: Part, forces: Forces):
-        # behind the last sample there is nothing but filling
-        self.count, self.size = int(np.sum(part.weight > 0.0)), len(part.time)
-        self.step, self.force, self.by_number, self.defect, self.readings = (
-            matrix[: self.count] for matrix in (part.step, part.force, part.by_number, part.defect, part.readings)
-        )
-        self.forces = forces
-        self.states, self.own_width = self.defect.shape[1], 1 + self.by_number.shape[2]
-        self.width = self.own_width + forces.width + self.states
-        self.recursion = LinearPredictor.of(self.states, self.readings.shape[1], self.width)
-
-    def along(self, gains: Sequence[np.ndarray]) -> Iterator[tuple[slice, Arrays]]:
-        """Rows of some samples after the others, and the prediction errors there under each gain, rad, shape
-        (sides, samples, columns)."""
-        begun = np.zeros((self.states, self.width))
-        begun[:, -self.states :] = np.eye(self.states)
-        changes = [begun] * len(gains)
-        length = max(_VALUES // self.width, 64)
-        for first in range(0, self.count, length):
-            rows = slice(first, min(first + length, self.count))
-            driven = np.zeros((self.states, rows.stop - first, self.width))
-            driven[:, :, 0] = self.defect[rows].T
-            driven[:, :, 1 : self.own_width] = self.by_number[rows].transpose(1, 0, 2)
-            driven[:, :, self.own_width : -self.states] = self.forces.driving(self.force[rows], rows)
-            changes, errors = self.recursion(changes, gains, self.step[rows], driven, self.readings[rows])
-            yield rows, errors
-
-
-def _errors(part: Part, gain: np.ndarray, forces: Forces) -> np.ndarray:
-    """Prediction errors, rad, by side; columns as of :class:`_Columns`; shape (samples, sides, columns)."""
-    columns = _Columns(part, forces)
-    errors_of_all = np.zeros((columns.size, columns.readings.shape[1], columns.width))
-    for rows, (errors,) in columns.along([gain]):
-        errors_of_all[rows] = errors.transpose(1, 0, 2)
-    return errors_of_all
-
-
-def _grams(part: Part, gains: Sequence[np.ndarray], forces: Forces) -> np.ndarray:
-    """Products of the columns of the prediction errors with one another, rad^2, for several gains, by side;
-    shape (gains, sides, columns, columns)."""
-    columns = _Columns(part, forces)
-    total = np.zeros((len(gains), columns.readings.shape[1], columns.width, columns.width))
-    # of a gain under which errors diverge
-    with np.errstate(invalid="ignore", over="ignore"):
-        for _, errors_by_gain in columns.along(gains):
-            for sums, errors in zip(total, errors_by_gain, strict=True):
-                sums += np.matmul(errors.transpose(0, 2, 1), errors)
-    return total
-
-
-def _backwards(_: Leaves, adjoint: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
-    """A sample of an adjoint recursion: a matrix, row by row, and what is added."""
-    count = len(adjoint)
-    new = [inputs[count * count + i] for i in range(count)]
-    for i in range(count):
-        for k in range(count):
-            new[i] = new[i] + inputs[k * count + i] * adjoint[k]
-    return new, adjoint
-
-
-def _gradient(part: Part, gain: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Derivative of the sum of products of errors with `left` by the torque at each sample, shape (samples, sides + 1)."""
-    states, sides = part.defect.shape[1], left.shape[1]
-    # A (1 - K C); nothing of the gain is on the effects' own states
-    gains, closed, added = np.zeros((states, sides)), np.array(part.step), np.zeros((len(left), states))
-    gains[: 2 * sides] = np.concatenate([np.diag(column) for column in gain.T])
-    closed[:, :, :sides] -= part.step @ gains
-    added[:, :sides] = -left * part.weight[:, None]
-    inputs = [*closed.reshape(len(left), -1).T, *added.T]
-    rows = scan_signal(_backwards, [], [np.zeros(1)] * states, [column[::-1] for column in inputs])
-    adjoints = np.stack([row[::-1, 0] for row in rows], axis=1)
-    return np.einsum("tij,ti->tj", part.force, adjoints)
+        defect[:-1] = value[: count - 1] - vectors[1:count]
+    step, force, by_number = np.split(slope, (len(order), len(order) + side_count + 1), axis=2)
+    part = Part(time, torque, position, velocity, acceleration, modelled, deviation, held, before=segment.before)
+    return part, _Steps(step, force, by_number, defect, read)
 
 
 _COARSE_SMOOTHNESS = 10.0 ** np.arange(-11.0, 1.0)
@@ -310,24 +295,25 @@ class Linear:
         self.free, self.theta, self.prior = tuple(free), np.asarray(theta), prior
         self.experiment = set_free_parameters(experiment, free, self.theta)
         self.period, self.sides = segments[0].period, experiment.sides
-        self.parts = [_part(self.experiment, free, self.theta, segment) for segment in segments]
-        self.signals = [
-            MotionTorques(self.experiment, part, segment.torques) for part, segment in zip(self.parts, segments, strict=True)
-        ]
-        self.count = sum(signals.samples for signals in self.signals)
-        self.states = self.parts[0].defect.shape[1]
+        self.steps, self.signals = list[_Steps](), list[MotionTorques]()
+        for segment in segments:
+            part, steps = _linearise(self.experiment, free, self.theta, segment)
+            self.steps.append(steps)
+            self.signals.append(MotionTorques(self.experiment, part, segment))
+        self.count, self.states = sum(map(len, segments)), self.steps[0].defect.shape[1]
         self.input_gain = float(_figures(self.experiment)[0])
         self.drive, self.driven = find_driving_torque(self.experiment, segments)
         self._noise, self._scales = reading_noise(segments), dict[str, Scales]()
 
     def scales(self, name: str) -> Scales:
-        """Measure how large things are on the record, as an effect sees them; frequencies are sought anew each time."""
+        """Measure how large things are on the record, as an effect sees them; frequencies and waves only if it has some."""
         place = self.experiment.drive.resolve_place(name.partition(".")[0])
         scales, kinds = self._scales_at(place), {role.kind for role in EFFECTS[name].roles().values()}
-        if "frequency" in kinds:
+        if "frequency" in kinds and not scales.frequencies:
             scales = scales._replace(frequencies=tuple(self.frequencies(place)))
-        if "harmonic" in kinds and place in self.sides:
+        if "harmonic" in kinds and place in self.sides and not scales.waves:
             scales = scales._replace(waves=tuple(self.waves(place)))
+        self._scales[place] = scales
         return scales
 
     def _scales_at(self, place: str) -> Scales:
@@ -335,7 +321,7 @@ class Linear:
             return self._scales[place]
 
         def join(of) -> np.ndarray:
-            return np.concatenate([of(signals.part)[signals.real] for signals in self.signals])
+            return np.concatenate([of(signals.part)[: signals.samples] for signals in self.signals])
 
         side = place if place in self.sides else "motor"
         position = join(lambda part: part.position[self.sides[-1] if place == "transmission" else side])
@@ -386,12 +372,12 @@ class Linear:
 
     def predictor(self, smoothness: Sequence[float]) -> Predictor:
         """Prediction errors under a given gain."""
-        (predictor,) = self._predictors([list(smoothness)], [Forces(())] * len(self.parts))
+        (predictor,) = self._predictors([list(smoothness)], [Forces(())] * len(self.steps))
         return predictor
 
     def errors(self, smoothness: Sequence[float]) -> Arrays:
         """Prediction errors under a given gain, part by part, rad; shape (samples, sides, columns)."""
-        return [_errors(part, find_gains(smoothness, self.period), Forces(())) for part in self.parts]
+        return [steps.errors(find_gains(smoothness, self.period), Forces(())) for steps in self.steps]
 
     @cached_property
     def chosen(self) -> Predictor:
@@ -411,7 +397,7 @@ class Linear:
 
     def _predictors(self, options: list[list[float]], forces: list[Forces]) -> list[Predictor]:
         gains = [find_gains(smoothness, self.period) for smoothness in options]
-        grams = [_grams(part, gains, force) for part, force in zip(self.parts, forces, strict=True)]
+        grams = [steps.grams(gains, force) for steps, force in zip(self.steps, forces, strict=True)]
         return [Predictor(self, smoothness, [gram[i] for gram in grams]) for i, smoothness in enumerate(options)]
 
     def frequencies(self, place: str) -> list[float]:
@@ -419,7 +405,7 @@ class Linear:
         i = int(np.argmax([signals.samples for signals in self.signals]))
         span, top = self.signals[i].samples * self.period, self._highest
         few = np.geomspace(min(1.0 / span, 0.5 * top), top, _COARSE)
-        slope, power = self._answer(i, place, few, 2.0 * np.pi * self.parts[i].time)
+        slope, power = self._answer(i, place, few, 2.0 * np.pi * self.signals[i].part.time)
         size = 4 * 2 ** int(np.ceil(np.log2(len(slope))))
         frequency = np.fft.rfftfreq(size, self.period)
         inside = (frequency >= _LEAST_PERIODS / span) & (frequency <= top)
@@ -442,30 +428,30 @@ class Linear:
 
     def _wave_count(self, place: str) -> int:
         """Number of waves a turn that samples still tell apart where the side moves as fast as in a quarter of the log."""
-        speed = np.concatenate([np.abs(signals.part.velocity[place])[signals.real] for signals in self.signals])
+        speed = np.concatenate([np.abs(signals.part.velocity[place])[: signals.samples] for signals in self.signals])
         return int(np.clip(0.5 * np.pi / max(float(np.quantile(speed, 0.25)) * self.period, 1e-9), 1, _MOST_WAVES))
 
     def _answer(self, i: int, place: str, few: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tell what a torque on a side does to the prediction errors of a part under the :attr:`chosen` predictor, at what
         that leaves over: their derivative by the torque at each sample, shape (samples,); and the power of the response to
         waves of `few` periods along a `phase`, shape (waves,)."""
-        part, side, predictor = self.parts[i], self.sides.index(place), self.chosen
+        steps, side, predictor = self.steps[i], self.sides.index(place), self.chosen
         gain, deviation = find_gains(predictor.smoothness, self.period), predictor.deviation
         if not np.isfinite(deviation).all():
             # no predictor follows this model
             return np.zeros(self.signals[i].samples), np.ones(len(few))
-        left = _errors(part, gain, Forces(())) @ predictor.coefficients[i]
+        left = steps.errors(gain, Forces(())) @ predictor.coefficients[i]
         along = few[:, None] * phase[None, :]
         waves = Forces([{side: np.concatenate([np.sin(along), np.cos(along)])}])
-        responses = _errors(part, gain, waves)[:, :, 1 + part.by_number.shape[2] : -self.states]
+        responses = steps.errors(gain, waves)[:, :, 1 + len(self.free) : -self.states]
         power = np.sum((responses / deviation[None, :, None]) ** 2, axis=(0, 1)).reshape(2, -1).mean(axis=0)
-        return _gradient(part, gain, left / deviation[None, :] ** 2)[: self.signals[i].samples, side], power
+        return steps.gradient(gain, left / deviation[None, :] ** 2)[:, side], power
 
     def find_errors_left(self, smoothness: Sequence[float]) -> Arrays:
         """Errors that are left under a given gain when all numbers are at their best, part by part, rad; shape
         (samples, sides)."""
-        parts = self.errors(smoothness), self.predictor(smoothness).coefficients, self.signals
-        return [(errors @ coefficients)[signals.real] for errors, coefficients, signals in zip(*parts, strict=True)]
+        parts = self.errors(smoothness), self.predictor(smoothness).coefficients
+        return [errors @ coefficients for errors, coefficients in zip(*parts, strict=True)]
 
     def products(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> list[Products]:
         """Products of everything that the prediction errors are linear in, initial states eliminated: of the model alone,
@@ -474,9 +460,11 @@ class Linear:
         forces_of_all = [[Forces(columns_of(group, signals)) for signals in self.signals] for group in groups]
 
         def multiply(forces: list[Forces]) -> tuple[np.ndarray, np.ndarray]:
-            pairs = list(zip(self.signals, forces, strict=True))
-            grams = [np.einsum("s,scd->cd", noise**-2.0, _grams(signals.part, [gain], force)[0]) for signals, force in pairs]
-            power = np.sum([self._power(force, signals) for signals, force in pairs], axis=0)
+            grams = [
+                np.einsum("s,scd->cd", noise**-2.0, steps.grams([gain], force)[0])
+                for steps, force in zip(self.steps, forces, strict=True)
+            ]
+            power = np.sum([self._power(force) for force in forces], axis=0)
             return np.sum([_eliminate(gram, self.states) for gram in grams], axis=0), power
 
         # the constant and the own numbers come first
@@ -508,7 +496,7 @@ class Linear:
         owners = [*(owner_of(number)[0] for number in self.free), candidate]
         return {1 + k: (1 + i, slopes[k] / slopes[i]) for k, name in enumerate(owners) if (i := self.same(name)) is not None}
 
-    def _power(self, torques: Forces, signals: MotionTorques) -> np.ndarray:
+    def _power(self, torques: Forces) -> np.ndarray:
         """Sums of squares of torques, referred to the motor."""
         over = {i: float(self.experiment.drive.ratio(side)) for i, side in enumerate(self.sides)}
         return torques.squares(over | {-1: 1.0 / self.input_gain})
@@ -540,7 +528,7 @@ class Linear:
         for signals in self.signals:
             torques, *plain_torques = signals.of([effect, *plain])
             apart = {place: torque - sum(law.get(place, 0.0) for law in plain_torques) for place, torque in torques.items()}
-            power += self._power(Forces([apart]), signals)[0]
+            power += self._power(Forces([apart]))[0]
         return float(np.sqrt(power / self.count)) / self.drive
 
     def same(self, name: str) -> int | None:

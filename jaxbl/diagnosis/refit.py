@@ -288,14 +288,14 @@ class _Fit:
         if not np.isfinite(point.cost):
             return fitted
         size = np.sqrt(point.predictor.given / linear.count)
-        for errors, signals in zip(linear.errors(point.predictor.smoothness), linear.signals, strict=True):
+        for errors in linear.errors(point.predictor.smoothness):
             flat = (errors / size[None, :, None]).reshape(-1, errors.shape[2])
             states = flat[:, -linear.states :]
             norm = np.sqrt(np.sum(states**2, axis=0))
             visible = norm > SILENT * np.max(norm)
             basis = np.linalg.qr(states[:, visible] / norm[visible])[0]
             projected = flat[:, : 1 + count] - basis @ (basis.T @ flat[:, : 1 + count])
-            pieces.append(projected.reshape(-1, sides, 1 + count)[signals.real])
+            pieces.append(projected.reshape(-1, sides, 1 + count))
         errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)
         foretold = errors[:, :, 0].copy()
         changes = np.zeros((QUARTERS, count))

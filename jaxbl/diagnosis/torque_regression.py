@@ -71,9 +71,8 @@ class TorqueRegression:
         self.variants, forces = list(variants), []
         for signals in linear.signals:
             # the model's own acceleration, where torque is missing, is not that of the log
-            measured = MotionTorques(
-                linear.experiment, replace(signals.part, modelled=signals.part.acceleration), signals.shared
-            )
+            part = replace(signals.part, modelled=signals.part.acceleration)
+            measured = MotionTorques(linear.experiment, part, signals.segment)
             there = measured.of([get_leaf(linear.experiment, f"effects.{name}") for name in names])
             gone = [{place: -torque for place, torque in torques.items()} for torques in there]
             forces.append(Forces([*there, *gone, *columns_of([*base, *variants], measured)]))

@@ -58,7 +58,7 @@ def geared_model():
 
 def prediction_errors(model, forces=None):
     """Prediction errors over the noise, initial states eliminated: constant, own numbers, forces."""
-    predicted = module._errors(model.parts[0], find_gains([1e-6] * len(model.sides), model.period), forces or Forces([]))
+    predicted = model.steps[0].errors(find_gains([1e-6] * len(model.sides), model.period), forces or Forces([]))
     flat = predicted.reshape(-1, predicted.shape[2])
     basis = np.linalg.qr(flat[:, -model.states :])[0]
     remainder = flat[:, : -model.states]
@@ -187,7 +187,7 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     models = model.products(variants, smoothness, noise)
     assert sum(variant.width for variant in variants) > 2 * module._TOGETHER
     forces = Forces(columns_of(variants, model.signals[0]))
-    predicted = module._errors(model.parts[0], find_gains(smoothness, model.period), forces)
+    predicted = model.steps[0].errors(find_gains(smoothness, model.period), forces)
     gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
     expected = module._eliminate(gram, model.states)
     size = np.sqrt(np.diag(expected))
@@ -210,9 +210,9 @@ def test_torques_that_models_share_are_those_of_each(monkeypatch, held):
     variants = variants_of(first.experiment, names, lambda name: LOG)
     columns_of(variants, first.signals[0])
     model = linearise(2, theta=0.1)
-    (signals,), shared_part = model.signals, first.signals[0].shared
-    assert len(shared_part) > 100
-    shared = MotionTorques(model.experiment, model.parts[0], shared_part)
+    (signals,), segment = model.signals, first.signals[0].segment
+    assert len(segment.torques) > 100
+    shared = MotionTorques(model.experiment, signals.part, segment)
     for variant, shared_torques, own_torques in zip(
         variants, columns_of(variants, shared), columns_of(variants, signals), strict=True
     ):
@@ -261,7 +261,7 @@ def test_a_gain_under_which_rounding_would_decide_is_left_out(monkeypatch):
 
 
 def test_eccentricity_is_tried_once_a_turn_however_small_the_motion(geared_model):
-    travel = float(np.ptp(np.asarray(geared_model.parts[0].position["load"])))
+    travel = float(np.ptp(np.asarray(geared_model.signals[0].part.position["load"])))
     least = int(np.floor(0.5 / travel)) + 1
     assert least < 10  # twice a motor turn, with a gear ratio of 5
     trials = (

@@ -30,7 +30,7 @@ study = {"title": "t", "drive": {"kind": "rigid", "motor_inertia": 0.05, "motor_
 model = as_arrays(prepare(read_config(study)), float)
 states = simulate_plant(model, model.plant.init(model.initial), np.sin(5.0 * time))
 motion = [{"motor": np.sin(9.0 * time)}] * 3
-part = candidates.Part(time, time, *motion, None, None, None, None, None, None, None, None, None)
+part = candidates.Part(time, time, *motion, None, None, None)
 needed = candidates._find_needed(model, part)["motor"]
 print(len(traced), repr(float(np.sum(needed))), repr(float(np.sum(states.position["motor"]))))
 """
