@@ -70,9 +70,7 @@ def coordinates_of(
 
     coordinates = {
         EVERYWHERE: CoordinateValues(np.zeros(len(velocity), int), classes=("everywhere",)),
-        "direction": CoordinateValues(
-            np.where(still, 1, np.where(velocity > 0.0, 2, 0)), classes=("backward", "at rest", "forward"),
-        ),
+        "direction": _by_sign(velocity, still, "backward", "at rest", "forward"),
         "reversals": _near_reversals(part, velocity, still, residual.bandwidth),
     }  # fmt: skip
     geared = len(part.position) > 1 and experiment.transmission is not None
@@ -127,12 +125,16 @@ def _gear_classes(experiment: Experiment, part: Kinematics) -> dict[str, Coordin
     torque = np.asarray(find_transmitted(experiment, part) if part.transmitted is None else part.transmitted)
     if plant.half_gap > 0.0:
         twist = np.asarray(plant.twist(part.position))
-        inside = np.where(np.abs(twist) < plant.half_gap, 1, np.where(twist > 0.0, 2, 0))
-        classes["gap"] = CoordinateValues(inside, classes=("outside, z < 0", "inside of the gap", "outside, z > 0"))
+        inside = np.abs(twist) < plant.half_gap
+        classes["gap"] = _by_sign(twist, inside, "outside, z < 0", "inside of the gap", "outside, z > 0")
     idle = np.abs(torque) < _IDLE * rms(torque)
-    loaded = np.where(idle, 1, np.where(torque > 0.0, 2, 0))
-    classes["load sign"] = CoordinateValues(loaded, classes=("negative load", "no load", "positive load"))
+    classes["load sign"] = _by_sign(torque, idle, "negative load", "no load", "positive load")
     return classes
+
+
+def _by_sign(values: np.ndarray, is_none: np.ndarray, *classes: str) -> CoordinateValues:
+    """Classes of a signal: negative, none, positive."""
+    return CoordinateValues(np.where(is_none, 1, np.where(values > 0.0, 2, 0)), classes=classes)
 
 
 def _near_reversals(part: Kinematics, velocity: np.ndarray, still: np.ndarray, bandwidth: float) -> CoordinateValues:

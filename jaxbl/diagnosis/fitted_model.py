@@ -1,6 +1,5 @@
 """A model with some effects whose numbers are all fitted, and what may be said of these numbers."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,26 +11,28 @@ from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.estimation.logs import arrays
 from jaxbl.fused import Arrays
 
-from .linearised_model import Linear
+from .linearised_model import Linear, Predictor
 from .thresholds import LIMITS
 
 LEAST_LEFT = 0.05
 """Share of a positive number that is left of it at least where it is moved."""
 
 
-class FitEnd(NamedTuple):
-    """End of a fit of prediction errors.
+class FitPoint(NamedTuple):
+    """Numbers and initial states that a fit of prediction errors has tried.
 
     Attributes:
-        theta: of the model's own numbers.
+        theta: of all numbers.
         start: initial positions and velocities of each segment.
-        smoothness: of each side's predictor.
+        linear: the model there, along the path of its predictor.
+        predictor: of it.
         cost: minus twice the log-likelihood, with the prior.
     """
 
     theta: np.ndarray
     start: Arrays
-    smoothness: Sequence[float]
+    linear: Linear
+    predictor: Predictor
     cost: float
 
 
@@ -45,12 +46,11 @@ class FittedModel(NamedTuple):
         theta: of these.
         covariance: of theta.
         white: the same if prediction errors are white, as those of a complete model.
-        linear: the model along the log; of the model as given, with its own numbers fitted.
+        end: where the fit ended: another one begins there.
         left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
         log_odds: of the effects before the log is seen, nats.
         log_evidence: nats, by Laplace's method (D. MacKay, Neural Computation 4, 1992); only differences count.
         foretold: prediction errors, each quarter by numbers fitted without it, rad, shape (samples, sides).
-        end: where the fit ended: another one begins there.
     """
 
     names: tuple[str, ...]
@@ -59,12 +59,16 @@ class FittedModel(NamedTuple):
     theta: np.ndarray
     covariance: np.ndarray
     white: np.ndarray
-    linear: Linear
+    end: FitPoint
     left_out: np.ndarray | None = None
     log_odds: float = 0.0
     log_evidence: float = -np.inf
     foretold: np.ndarray | None = None
-    end: "FitEnd | None" = None
+
+    @property
+    def linear(self) -> Linear:
+        """The model along the log; of the model as given, with its own numbers fitted."""
+        return self.end.linear
 
     def share(self, name: str) -> float:
         """Torque of an effect along the log, rms over the driving torque's."""
@@ -106,10 +110,7 @@ def special_case(fitted: FittedModel, name: str) -> str | None:
     """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
     better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
     cls, errors, place = EFFECTS[name], fitted.errors(), name.partition(".")[0]
-    apart = []
-    for leaf, role in cls.roles().items():
-        path = f"effects.{name}.{leaf}"
-        if role.kind in ("shape", "frequency") and path in errors:
-            apart.append(errors[path] < abs(float(get_leaf(fitted.experiment, path))))
+    paths = [f"effects.{name}.{leaf}" for leaf, role in cls.roles().items() if role.kind in ("shape", "frequency")]
+    apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in paths if path in errors]
     plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
     return plain if apart and not any(apart) else None

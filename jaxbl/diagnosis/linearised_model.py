@@ -324,6 +324,9 @@ class Linear:
             return np.concatenate([of(signals.part)[: signals.samples] for signals in self.signals])
 
         side = place if place in self.sides else "motor"
+        speed = join(lambda part: part.velocity[side])
+        # samples tell waves apart where the side moves as fast as in a quarter of the log
+        slow = float(np.quantile(np.abs(speed), 0.25))
         position = join(lambda part: part.position[self.sides[-1] if place == "transmission" else side])
         ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
         if len(self.sides) == 2:
@@ -334,13 +337,13 @@ class Linear:
             duration=self.count * self.period,
             twist=rms(twist),
             largest_twist=float(np.max(np.abs(twist))),
-            speed=rms(join(lambda part: part.velocity[side])),
+            speed=rms(speed),
             spread=float(np.std(position)),
             travel=float(np.ptp(position)),
             noise=self._noise[side],
             ratio=ratio,
             harmonics=self._harmonics(side),
-            wave_count=self._wave_count(side),
+            wave_count=int(np.clip(0.5 * np.pi / max(slow * self.period, 1e-9), 1, _MOST_WAVES)),
         )
         return self._scales[place]
 
@@ -413,8 +416,8 @@ class Linear:
 
     def waves(self, place: str) -> list[float]:
         """Periods a turn at which a torque over the position of a side explains most."""
-        count = self._wave_count(place)
-        few = np.unique(np.round(np.geomspace(1.0, max(count, 2), _COARSE)))
+        log = self._scales_at(place)
+        few = np.unique(np.round(np.geomspace(1.0, max(log.wave_count, 2), _COARSE)))
         by_place, power = np.zeros(_PLACES), 0.0 * few
         for i, signals in enumerate(self.signals):
             position = signals.part.position[place]
@@ -423,13 +426,8 @@ class Linear:
             by_place += np.bincount(np.minimum(where.astype(int), _PLACES - 1), slope, _PLACES)
             power += more
         number = np.arange(_PLACES // 2 + 1.0)
-        inside = (number * self._scales[place].travel > TRIAL_ARC) & (number <= count)
+        inside = (number * log.travel > TRIAL_ARC) & (number <= log.wave_count)
         return _peaks(number, np.abs(np.fft.rfft(by_place)) ** 2, few, power, inside, 1)
-
-    def _wave_count(self, place: str) -> int:
-        """Number of waves a turn that samples still tell apart where the side moves as fast as in a quarter of the log."""
-        speed = np.concatenate([np.abs(signals.part.velocity[place])[: signals.samples] for signals in self.signals])
-        return int(np.clip(0.5 * np.pi / max(float(np.quantile(speed, 0.25)) * self.period, 1e-9), 1, _MOST_WAVES))
 
     def _answer(self, i: int, place: str, few: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tell what a torque on a side does to the prediction errors of a part under the :attr:`chosen` predictor, at what

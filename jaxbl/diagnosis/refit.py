@@ -10,12 +10,11 @@ Association 90 (1995).
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxbl.chain import Experiment
-from jaxbl.drive.effects import EFFECTS, Numbers, make_effect
+from jaxbl.drive.effects import EFFECTS, make_effect
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters, set_free_parameters
@@ -29,8 +28,8 @@ from jaxbl.records.least_squares import BlockRegression
 
 from .blocks import QUARTERS
 from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law, owner_of
-from .fitted_model import LEAST_LEFT, FitEnd, FittedModel
-from .linearised_model import SILENT, Linear, Predictor, find_gains
+from .fitted_model import LEAST_LEFT, FitPoint, FittedModel
+from .linearised_model import SILENT, Linear, find_gains
 from .neutral_effects import complete, lean
 from .reference_log import BLOCKS, parts_of_blocks
 from .thresholds import LIMITS
@@ -43,16 +42,6 @@ _LEAST_STEP = 0.05
 """Share of a Gauss-Newton step below which no other is tried: friction and gaps make errors rough (benchmarks/NOTES.md)."""
 _ROUNDS = 4
 """Choices of the predictor at most, each followed by a fit."""
-
-
-class _Point(NamedTuple):
-    """Numbers and initial states tried: the model there, and minus twice the log-likelihood."""
-
-    theta: np.ndarray
-    start: Arrays
-    linear: Linear
-    predictor: Predictor
-    cost: float
 
 
 class ModelFits:
@@ -107,23 +96,21 @@ class ModelFits:
                 to a dry friction may lead over a hill.
         """
         end = None if begin is None else begin.end
-        before = theta if end is None else end.theta
-        starts = [(1.0, theta, end), *([(0.0, before, end)] if new and end else [])]
+        before = theta if end is None else end.theta[: len(self.free)]
+
+        def fit_from(numbers: EffectNumbers, theta: np.ndarray, begin: FitPoint | None) -> tuple[_Fit, FitPoint]:
+            fit = _Fit(self, numbers)
+            return fit, fit.run(theta, begin)
+
+        ends = [fit_from(numbers, theta, end)]
+        if new and end is not None and not end.cost - ends[0][1].cost >= promise:
+            none = {name: {**numbers[name], **dict.fromkeys(EFFECTS[name].sizes(), 0.0)} for name in new}
+            ends.append(fit_from({**numbers, **none}, before, end))
         if np.any(np.abs(before) > LIMITS.far * self.prior):
             # numbers that are far from what is known of them stand for what is missing: no step may lead back from there
-            starts.append((1.0, 0.0 * theta, None))
-        best, fit = None, None
-        for share, start, where in starts:
-            if best is not None and share == 0.0 and end is not None and end.cost - best.cost >= promise:
-                continue
-            trial = _Fit(
-                self, {name: _scale(name, values, share) if name in new else values for name, values in numbers.items()}
-            )
-            point = trial.run(start, where)
-            if best is None or point.cost < best.cost:
-                best, fit = point, trial
-        assert best is not None and fit is not None
-        return fit.finish(best)
+            ends.append(fit_from(numbers, 0.0 * theta, None))
+        fit, point = min(ends, key=lambda pair: pair[1].cost)
+        return fit.finish(point)
 
     def unit(self, name: str, leaf: str, effects: EffectNumbers) -> float:
         """Find the value of a size of one of some effects at which its torque is as large as effects are."""
@@ -172,7 +159,7 @@ class _Fit:
         general = sum(is_finer_law(name) for name in numbers)
         self.log_odds = fits.log_odds + LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
 
-    def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> _Point:
+    def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> FitPoint:
         """Find the prediction errors along the path of the predictor."""
         path = self._path(theta, start, smoothness)
         linear = Linear(self.experiment, self.free, theta, self.width, path)
@@ -180,9 +167,9 @@ class _Fit:
         # where all is rounding, squares may come out below zero
         with np.errstate(invalid="ignore"):
             cost = float(linear.count * np.sum(np.log(predictor.given)) + np.sum((theta / self.width) ** 2))
-        return _Point(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
+        return FitPoint(theta, start, linear, predictor, cost if np.isfinite(cost) else np.inf)
 
-    def run(self, theta: np.ndarray, begin: FitEnd | None) -> _Point:
+    def run(self, theta: np.ndarray, begin: FitPoint | None) -> FitPoint:
         """Fit from the model's own numbers; the predictor is chosen anew until that gains nothing."""
         theta = theta.copy()
         for name, i in self.released.items():
@@ -197,7 +184,7 @@ class _Fit:
             start = [np.array([state[side][order] for order in (0, 1) for side in sides]) for state in first]
         else:
             start = begin.start
-        best = self._descend(self.at(theta, start, self._choose(theta) if begin is None else begin.smoothness))
+        best = self._descend(self.at(theta, start, self._choose(theta) if begin is None else begin.predictor.smoothness))
         for turn in range(_ROUNDS):
             if not np.isfinite(best.cost):
                 break
@@ -224,7 +211,7 @@ class _Fit:
         """Choose the predictor along the smoothed motion."""
         return Linear(self.experiment, self.free, theta, self.width, self.segments).chosen.smoothness
 
-    def _descend(self, best: _Point) -> _Point:
+    def _descend(self, best: FitPoint) -> FitPoint:
         share = 1.0
         for _ in range(_STEPS):
             if best.cost - best.predictor.promise < _SETTLED or share < _LEAST_STEP:
@@ -275,15 +262,14 @@ class _Fit:
             path.append(dataclasses.replace(segment, smoothed=filtered))
         return path
 
-    def finish(self, point: _Point) -> FittedModel:
+    def finish(self, point: FitPoint) -> FittedModel:
         """Make the model, its covariance, and its errors; each quarter's by numbers fitted without it."""
         linear, pieces = point.linear, []
-        end = FitEnd(point.theta[: len(self.fits.free)], point.start, point.predictor.smoothness, point.cost)
         count, sides = len(self.free), len(self.experiment.sides)
         none = np.full((count, count), np.inf)
         fitted = FittedModel(
-            tuple(self.numbers), linear.experiment, self.free, point.theta, none, none, linear, np.zeros((QUARTERS, count)),
-            self.log_odds, end=end,
+            tuple(self.numbers), linear.experiment, self.free, point.theta, none, none, point, np.zeros((QUARTERS, count)),
+            self.log_odds,
         )  # fmt: skip
         if not np.isfinite(point.cost):
             return fitted
@@ -339,11 +325,6 @@ class _Fit:
                 covariance=rows @ fitted.covariance @ rows.T + shared, white=rows @ fitted.white @ rows.T + shared,
             )  # fmt: skip
         return fitted
-
-
-def _scale(name: str, numbers: Numbers, share: float) -> Numbers:
-    sizes = EFFECTS[name].sizes()
-    return {leaf: value * share if leaf in sizes else value for leaf, value in numbers.items()}
 
 
 def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray) -> np.ndarray:
