@@ -258,7 +258,7 @@ class MotionTorques:
         self.sides, self.samples = experiment.sides, len(segment)
         needed = _find_needed(experiment, part) if any(samples.any() for samples in part.held.values()) else None
         self.direction = {side: self._direction(side, needed) for side in self.sides}
-        self.known: dict[Candidate, Torques] = {}
+        self.own: dict[tuple, Torques] = {}
 
     def _direction(self, side: str, needed: Mapping[str, jax.Array] | None) -> np.ndarray:
         """Direction of motion of a side, between -1 and 1; where it stands still, of the torque that holds it (`needed`)."""
@@ -281,16 +281,13 @@ class MotionTorques:
     def of(self, effects: Sequence[AbstractEffect], from_rest: bool = False) -> list[Torques]:
         """Torque that each effect adds, on top of what a model without it has. Before the first input known that one had
         lasted, or with `from_rest` nothing had happened."""
-        torques_of: list[Torques] = [{}] * len(effects)
-        asked: dict[str, list[int]] = {}
-        for i, effect in enumerate(effects):
-            stored = self.segment.torques.get(_key(effect, from_rest)) if self._shares(effect) else None
-            if stored is None:
-                asked.setdefault(effect.name, []).append(i)
-            else:
-                torques_of[i] = stored
-        for name, indices in asked.items():
-            place = self.experiment.drive.resolve_place(effects[indices[0]].place)
+        places = [(self._store(effect), _key(effect, from_rest)) for effect in effects]
+        asked: dict[str, list[AbstractEffect]] = {}
+        for effect, (store, key) in zip(effects, places, strict=True):
+            if key not in store:
+                asked.setdefault(effect.name, []).append(effect)
+        for name, alike in asked.items():
+            place = self.experiment.drive.resolve_place(alike[0].place)
             # of the model's own only those in the gear matter (of one inertia those on the load), and only for others there:
             # one structure, and one program
             near = "load" if self.experiment.transmission is None else "transmission"
@@ -302,31 +299,26 @@ class MotionTorques:
             bare = with_effects(self.experiment, tuple(gear))
             # friction of the gear is on the motor's side; an effect on the input needs none
             direction = self.direction.get("motor" if place == "transmission" else place, self.part.torque)
-            for first in range(0, len(indices), _AT_ONCE):
-                batch = indices[first : first + _AT_ONCE]
+            for first in range(0, len(alike), _AT_ONCE):
+                batch = alike[first : first + _AT_ONCE]
                 # as many at once each time, so that one compiled program serves
-                spare = [effects[batch[-1]]] * (_AT_ONCE - len(batch))
-                members = (*(effects[i] for i in batch), *spare)
+                members = (*batch, *[batch[-1]] * (_AT_ONCE - len(batch)))
                 stack = jax.tree.map(lambda *x: np.array([float(leaf) for leaf in x]), *members)
                 torques = _torques(bare, stack, self.part, direction, from_rest)
                 rows = {side: np.asarray(torque)[:, : self.samples] for side, torque in torques.items()}
-                for k, i in enumerate(batch):
-                    torques_of[i] = {side: torque[k] for side, torque in rows.items()}
-                    if self._shares(effects[i]):
-                        self.segment.torques[_key(effects[i], from_rest)] = torques_of[i]
-        return torques_of
+                for k, effect in enumerate(batch):
+                    self._store(effect)[_key(effect, from_rest)] = {side: torque[k] for side, torque in rows.items()}
+        return [store[key] for store, key in places]
 
-    def _shares(self, effect: AbstractEffect) -> bool:
-        """Tell whether the torque of an effect follows from motion and input alone: not in the gear, where the model has
-        torques of its own; nor where the model says how it moves, or what holds it at rest."""
+    def _store(self, effect: AbstractEffect) -> dict[tuple, Torques]:
+        """Where torques of an effect are kept: with the segment if they follow from motion and input alone: not in the gear,
+        where the model has torques of its own; nor where the model says how it moves, or what holds it at rest."""
         place, kind = self.experiment.drive.resolve_place(effect.place), type(effect)
-        if place == "actuator":
-            return True
         held = place in self.sides and self.part.held[place].any()
-        return place != "transmission" and not any(
-            getattr(kind, hook) is not getattr(AbstractEffect, hook)
-            for hook in ("added_inertia", *(("dry_friction", "holds") if held else ()))
-        )
+        hooks = ("added_inertia", *(("dry_friction", "holds") if held else ()))
+        depends = any(getattr(kind, hook) is not getattr(AbstractEffect, hook) for hook in hooks)
+        shared = place == "actuator" or (place != "transmission" and not depends)
+        return self.segment.torques if shared else self.own
 
 
 def _key(effect: AbstractEffect, from_rest: bool) -> tuple:
@@ -335,13 +327,13 @@ def _key(effect: AbstractEffect, from_rest: bool) -> tuple:
 
 def columns_of(candidates: Sequence[Candidate], signals: MotionTorques) -> list[Torques]:
     """Columns of each candidate."""
-    new = [candidate for candidate in candidates if candidate not in signals.known]
+    columns: dict[Candidate, Torques] = {}
     for from_rest in (False, True):
-        alike = [candidate for candidate in new if candidate.from_rest == from_rest]
+        alike = [candidate for candidate in candidates if candidate.from_rest == from_rest]
         torques = iter(signals.of([effect for candidate in alike for effect in candidate.effects], from_rest))
         for candidate in alike:
-            signals.known[candidate] = candidate.columns(signals, [next(torques) for _ in candidate.effects])
-    return [signals.known[candidate] for candidate in candidates]
+            columns[candidate] = candidate.columns(signals, [next(torques) for _ in candidate.effects])
+    return [columns[candidate] for candidate in candidates]
 
 
 @jit
