@@ -62,7 +62,7 @@ class Candidate:
         effects: effects whose torques the columns are made of.
         columns: columns from a motion and the torque of each effect along it; behind them what is there at coefficients of
             0, if anything is.
-        numbers: the effect's numbers from the coefficients; None where they are not allowed.
+        numbers: the effect's numbers from the coefficients, none of what is no effect; None where they are not allowed.
         offset: whether something is there at coefficients of 0.
         from_rest: whether nothing had happened before the first input known; else that one had lasted.
         spread: prior standard deviation of the coefficients; 0 where their torque sets it.
@@ -72,13 +72,13 @@ class Candidate:
     width: int
     effects: tuple[AbstractEffect, ...]
     columns: Callable[["MotionTorques", Sequence[Torques]], Torques]
-    numbers: Callable[[Sequence[float]], Numbers | None]
+    numbers: Callable[[Sequence[float]], Numbers | None] = lambda values: {}
     offset: bool = False
     from_rest: bool = False
     spread: float = 0.0
 
 
-NO_CANDIDATE = Candidate("", 0, (), lambda signals, torques: {}, lambda values: {})
+NO_CANDIDATE = Candidate("", 0, (), lambda signals, torques: {})
 
 
 def owner_of(number: FreeParameter) -> tuple[str, str]:

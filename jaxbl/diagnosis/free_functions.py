@@ -4,7 +4,7 @@ They are candidates like any other, with many columns and an amplitude that the 
 them is an effect with a name; if one pays after all effects with names have had their turn, something else is missing.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import jax.numpy as jnp
@@ -32,18 +32,9 @@ def functions_of(signals: Sequence[MotionTorques]) -> list[Candidate]:
             along = np.concatenate([_coordinate(part, name, side) for part in signals])
             span = float(along.min()), float(along.max())
             hats = partial(_make_hats, name, side, span, knots, friction)
-            functions.append(_candidate(side, kind, knots, hats))
-        functions.append(_candidate(side, "memory", len(_LENGTHS), partial(_make_stops, side)))
+            functions.append(Candidate(f"{side}.{kind}", knots, (), hats))
+        functions.append(Candidate(f"{side}.memory", len(_LENGTHS), (), partial(_make_stops, side)))
     return functions
-
-
-def _candidate(side: str, kind: str, width: int, shape: Callable[[MotionTorques], np.ndarray]) -> Candidate:
-    """A torque on a side that is a sum of columns, shape (samples, width), each of height 1."""
-
-    def columns(signals: MotionTorques, _: Sequence[Torques]) -> Torques:
-        return {signals.sides.index(side): -shape(signals).T}
-
-    return Candidate(f"{side}.{kind}", width, (), columns, lambda values: {})
 
 
 def _coordinate(signals: MotionTorques, name: str, side: str) -> np.ndarray:
@@ -52,22 +43,23 @@ def _coordinate(signals: MotionTorques, name: str, side: str) -> np.ndarray:
 
 
 def _make_hats(
-    name: str, side: str, span: tuple[float, float], count: int, friction: bool, part: MotionTorques
-) -> np.ndarray:
-    """Triangles of height 1 about evenly spaced knots, shape (samples, count)."""
+    name: str, side: str, span: tuple[float, float], count: int, friction: bool, signals: MotionTorques, _: Sequence[Torques]
+) -> Torques:
+    """Triangles of height 1 about evenly spaced knots, as torques on a side."""
     low, high = span
-    index = (_coordinate(part, name, side) - low) / max(high - low, 1e-300) * (count - 1)
+    index = (_coordinate(signals, name, side) - low) / max(high - low, 1e-300) * (count - 1)
     heights = np.maximum(1.0 - np.abs(index[:, None] - np.arange(count)[None, :]), 0.0)
-    return heights * part.direction[side][: part.samples, None] if friction else heights
+    columns = heights * signals.direction[side][: signals.samples, None] if friction else heights
+    return {signals.sides.index(side): -columns.T}
 
 
-def _make_stops(side: str, part: MotionTorques) -> np.ndarray:
-    """Elastoplastic elements of several lengths, between -1 and 1, shape (samples, lengths)."""
-    position = _coordinate(part, "position", side)
+def _make_stops(side: str, signals: MotionTorques, _: Sequence[Torques]) -> Torques:
+    """Elastoplastic elements of several lengths, between -1 and 1, as torques on a side."""
+    position = _coordinate(signals, "position", side)
     lengths = np.maximum(np.array(_LENGTHS) * np.std(position), 1e-300)
     way = np.diff(position, prepend=position[0])
     (columns,) = scan_signal(_advance_stop, [lengths], [0.0 * lengths], [way])
-    return columns
+    return {signals.sides.index(side): -columns.T}
 
 
 def _advance_stop(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:

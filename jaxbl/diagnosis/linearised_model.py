@@ -504,9 +504,7 @@ class Linear:
         if not self.driven:
             return np.inf
         # the torque of the input once more
-        again = Candidate(
-            "input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]}, lambda values: {}
-        )
+        again = Candidate("input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]})
         _, with_input = self.products([again], self.chosen.smoothness, self.chosen.deviation)
         return float(np.sqrt(with_input.products[-1, -1]))
 

@@ -180,8 +180,10 @@ class _Fit:
         theta = np.concatenate([theta, self.added])
         if begin is None:
             sides = self.experiment.sides
-            first = [{side: segment.smoothed[side].state[0] for side in sides} for segment in self.segments]
-            start = [np.array([state[side][order] for order in (0, 1) for side in sides]) for state in first]
+            start = [
+                np.array([segment.smoothed[side].state[0, order] for order in (0, 1) for side in sides])
+                for segment in self.segments
+            ]
         else:
             start = begin.start
         best = self._descend(self.at(theta, start, self._choose(theta) if begin is None else begin.predictor.smoothness))

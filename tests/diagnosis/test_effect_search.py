@@ -172,7 +172,7 @@ def test_numbers_that_are_all_off_are_no_effect(tmp_path):
 def test_a_free_function_without_a_solution_shows_nothing(monkeypatch):
     # no products of real columns: rounding made these of a function that is all but a number of the model
     alike = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1e9], [0.0, 1e9, 1.0]])
-    function = Candidate("motor.time", 1, (), lambda signals, torques: {}, lambda values: {})
+    function = Candidate("motor.time", 1, (), lambda signals, torques: {})
     models = [
         Products(candidate, alike[:count, :count], np.ones(count), np.zeros(count), {})
         for candidate, count in ((NO_CANDIDATE, 2), (function, 3))
