@@ -29,15 +29,15 @@ def standard_errors_better(log: ReferenceLog, control: Comparison, model: Compar
         for name, errors in control.samples.items()
         if not name.startswith("velocity") and BELOW not in name and errors.size >= BLOCKS
     ]
-    scales = [{name: comparison.gain if name.startswith("torque") else 1.0 for name in channels} for comparison in pair]
     floors = [log.noise_floor(comparison.torques) for comparison in pair]
-    noise = {name: np.sqrt(np.prod([floors[i][name] / scales[i][name] for i in range(2)])) for name in channels}
-    before, after = (
-        [comparison.samples[name].ravel() / (scale[name] * noise[name]) for name in channels]
-        for comparison, scale in zip(pair, scales, strict=True)
-    )
-    sizes = [np.sqrt(max(rms(old), 1.0) * max(rms(new), 1.0)) for old, new in zip(before, after, strict=True)]
-    before, after = ([errors / size for errors, size in zip(side, sizes, strict=True)] for side in (before, after))
+    before, after = [], []
+    for name in channels:
+        scales = [comparison.gain if name.startswith("torque") else 1.0 for comparison in pair]
+        noise = np.sqrt(np.prod([floor[name] / scale for floor, scale in zip(floors, scales, strict=True)]))
+        errors = [comparison.samples[name].ravel() / (scale * noise) for comparison, scale in zip(pair, scales, strict=True)]
+        size = np.sqrt(np.prod([max(rms(values), 1.0) for values in errors]))
+        before.append(errors[0] / size)
+        after.append(errors[1] / size)
     together = standard_errors_between(before, after)
     by_channel = [standard_errors_between([old], [new]) for old, new in zip(before, after, strict=True)]
     return max(together, *by_channel) if -min(by_channel) < LIMITS.difference < max(by_channel) else together

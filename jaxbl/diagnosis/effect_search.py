@@ -22,7 +22,17 @@ from jaxbl.records.least_squares import column_rms
 from jaxbl.workers import announce
 
 from .blocks import standard_errors_better, standard_errors_between
-from .candidates import Candidate, EffectNumbers, are_possible, contains, is_finer_law, owner_of, replaces, variants_of
+from .candidates import (
+    NO_CANDIDATE,
+    Candidate,
+    EffectNumbers,
+    are_possible,
+    contains,
+    is_finer_law,
+    owner_of,
+    replaces,
+    variants_of,
+)
 from .evidence import Evidence, Products, evidence_of
 from .fitted_model import FittedModel
 from .free_functions import functions_of
@@ -107,7 +117,7 @@ class _Proposal(NamedTuple):
     numbers: EffectNumbers
     change: np.ndarray | float = 0.0
     nats: float = np.inf
-    variant: Candidate | None = None
+    variant: Candidate = NO_CANDIDATE
 
 
 class Explanation(NamedTuple):
@@ -486,10 +496,10 @@ class EffectSearch:
         ranked = self._rank(linear, current.names, variants, predictor)
         if ranked:
             # a predictor chosen without an effect makes up for it
-            leaders = [linear.choose([proposal.variant]) for proposal in ranked[:_LEADERS] if proposal.variant is not None]
+            leaders = [linear.choose([proposal.variant]) for proposal in ranked[:_LEADERS]]
             predictor = min(leaders, key=lambda leader: leader.log_square)
             ranked = self._rank(linear, current.names, variants, predictor)
-        promised = {next(iter(proposal.numbers)): proposal for proposal in ranked[:_PROPOSED]}
+        promised = {proposal.variant.name: proposal for proposal in ranked[:_PROPOSED]}
         by_torque = regression.propose()[:_BY_TORQUE]
         additional = [
             effect for effect in by_torque if effect.name not in promised and effect.share > _PROMISING * by_torque[0].share
