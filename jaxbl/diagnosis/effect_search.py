@@ -290,15 +290,15 @@ class EffectSearch:
         are, which would stand for them."""
         current = self.fits.fit({}, 0.0 * self.fits.prior)
         for name in [name for name in self.lacking if name in self.expected or EFFECTS[name].in_log]:
-            proposals = [_Proposal({name: EFFECTS[name].neutral()})]
+            neutral = _Proposal({name: EFFECTS[name].neutral()})
             if name in self.expected:
-                linear, predictor, variants = self._vary(current, [name])
-                proposals = self._rank(linear, current.names, variants, predictor) or proposals
+                linear, variants = self._vary(current, [name])
+                ranked = self._rank(linear, current.names, variants, linear.chosen)
+                trial = self._try(current, ranked[0] if ranked else neutral)
+                stays, reason = self._is_possible(trial.fitted), "known to act"
             else:
                 self.lacking.remove(name)
-            trial = self._try(current, proposals[0])
-            stays, reason = self._is_possible(trial.fitted), "known to act"
-            if name not in self.expected:
+                trial = self._try(current, neutral)
                 stays = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
                 reason = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
             self._note(f"add {name}", trial.gain, stays, reason)
@@ -462,14 +462,14 @@ class EffectSearch:
         laws = [law for law in with_memory if law != name and is_finer_law(law) and replaces(law, name)]
         if not (waves or laws):
             return []
-        linear, predictor, variants = self._vary(current, [name, *laws])
+        linear, variants = self._vary(current, [name, *laws])
         suitable = [
             variant
             for variant in variants
             if variant.name != name or any(getattr(variant.effects[0], leaf) != count for leaf, count in waves.items())
         ]
         trials = list[Trial]()
-        for proposal in self._rank(linear, current.names, suitable, predictor, -np.inf):
+        for proposal in self._rank(linear, current.names, suitable, linear.chosen, -np.inf):
             (law,) = proposal.numbers
             fitted = self._try(current, proposal).fitted
             gain = self.gain(fitted, current)
@@ -484,16 +484,16 @@ class EffectSearch:
 
     # ---- proposals ----
 
-    def _vary(self, current: FittedModel, names: Sequence[str]) -> tuple[Linear, Predictor, list[Candidate]]:
-        """List the variants of effects that a log may show, and linearise a model along it, with its predictor."""
+    def _vary(self, current: FittedModel, names: Sequence[str]) -> tuple[Linear, list[Candidate]]:
+        """Linearise a model along the log, and list the variants of effects that this may show."""
         linear = self.fits.linearise(current.numbers, current.theta[: len(self.fits.prior)])
-        return linear, linear.chosen, variants_of(self.fits.nominal, names, linear.scales)
+        return linear, variants_of(self.fits.nominal, names, linear.scales)
 
     def _propose(self, current: FittedModel) -> list[_Proposal]:
         """Propose effects that may be missing, most promising first."""
-        linear, predictor, variants = self._vary(current, [name for name in self.lacking if name not in current.names])
+        linear, variants = self._vary(current, [name for name in self.lacking if name not in current.names])
         regression = self._regress(linear, current, variants)
-        ranked = self._rank(linear, current.names, variants, predictor)
+        ranked = self._rank(linear, current.names, variants, linear.chosen)
         if ranked:
             # a predictor chosen without an effect makes up for it
             leaders = [linear.choose([proposal.variant]) for proposal in ranked[:_LEADERS]]

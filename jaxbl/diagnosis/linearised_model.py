@@ -122,17 +122,14 @@ def _linearise(
     sides, smoothed = experiment.sides, segment.smoothed
     experiment, added = with_torques(experiment)
     count = len(segment)
-    size = bucket(count, _SAMPLES)
-
-    def pad(values: np.ndarray) -> np.ndarray:
-        return np.concatenate([values, np.repeat(values[-1:], size - count, axis=0)])
-
-    states = {side: pad(smoothed[side].state) for side in sides}
-    deviation = {side: pad(smoothed[side].deviation(1)) for side in sides}
+    # behind the last sample, that one again
+    rows = np.minimum(np.arange(bucket(count, _SAMPLES)), count - 1)
+    states = {side: smoothed[side].state[rows] for side in sides}
+    deviation = {side: smoothed[side].deviation(1)[rows] for side in sides}
     period = float(experiment.run.sample_period)
-    held = {side: np.pad(smoothed[side].find_standstill(period), (0, size - count)) for side in sides}
+    held = {side: np.pad(smoothed[side].find_standstill(period), (0, len(rows) - count)) for side in sides}
     read = np.stack([segment.readings[side] - smoothed[side].state[:, 0] for side in sides], axis=1)
-    time, torque = pad(segment.time), pad(segment.torque)
+    time, torque = segment.time[rows], segment.torque[rows]
     position, velocity, acceleration = ({side: states[side][:, i] for side in sides} for i in range(3))
     effects = effect_states(experiment, Path(time, torque, position, velocity, before=segment.before))
     motion = PlantState(position, velocity, jax.tree.map(np.asarray, effects))

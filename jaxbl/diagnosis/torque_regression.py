@@ -131,9 +131,14 @@ class TorqueRegression:
             best = max(plain or [most], key=lambda trial: trial.share)
             squares = best.squares
             chosen.append(best.variant)
-        numbers_of_all = _numbers_of(chosen, self._cross_validate(chosen)[1]) if chosen else []
-        pairs = zip(chosen, numbers_of_all, strict=True)
-        return {variant.name: numbers for variant, numbers in pairs if numbers is not None}
+        values = self._cross_validate(chosen)[1] if chosen else np.zeros(0)
+        numbers, place = {}, 0
+        for variant in chosen:
+            of = variant.numbers(values[place : place + variant.width].tolist())
+            place += variant.width
+            if of is not None:
+                numbers[variant.name] = of
+        return numbers
 
     def _try(self, beside: Sequence[Candidate], variant: Candidate, before: Sequence[np.ndarray]) -> TorqueProposal | None:
         """Try a candidate beside others; None where it takes nothing away, or its numbers are not allowed."""
@@ -141,7 +146,8 @@ class TorqueRegression:
         gains = np.sum([(old - new) / np.mean(old) for old, new in zip(before, after, strict=True)], axis=0)
         z = float(np.mean(gains) / max(mean_error(gains), 1e-300))
         ratio = np.prod([np.mean(new) / np.mean(old) for old, new in zip(before, after, strict=True)])
-        numbers = _numbers_of([*beside, variant], values)[-1]
+        place = sum(other.width for other in beside)
+        numbers = variant.numbers(values[place : place + variant.width].tolist())
         if numbers is None or not z > LIMITS.difference:
             return None
         return TorqueProposal(variant, numbers, 1.0 - float(np.sqrt(ratio)), after)
@@ -162,9 +168,3 @@ class TorqueRegression:
         joined = BlockRegression(np.sum([side.products for side in sides], axis=0), sides[0].counts)
         fits = joined.fit_without_each()
         return [side.held_out(fits) for side in sides], joined.fit()
-
-
-def _numbers_of(chosen: Sequence[Candidate], values: np.ndarray) -> list[Numbers | None]:
-    """Numbers of candidates whose coefficients are the first of some values."""
-    parts = np.split(values, np.cumsum([variant.width for variant in chosen]))
-    return [variant.numbers(part.tolist()) for variant, part in zip(chosen, parts, strict=False)]
