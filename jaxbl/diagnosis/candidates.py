@@ -311,8 +311,11 @@ class MotionTorques:
         return [store[key] for store, key in places]
 
     def _store(self, effect: AbstractEffect) -> dict[tuple, Torques]:
-        """Where torques of an effect are kept: with the segment if they follow from motion and input alone: not in the gear,
-        where the model has torques of its own; nor where the model says how it moves, or what holds it at rest."""
+        """Return where torques of an effect are kept: with the segment if they follow from motion and input alone.
+
+        They do not in the gear, where the model has torques of its own, nor where the model says how it moves, or what
+        holds it at rest.
+        """
         place, kind = self.experiment.drive.resolve_place(effect.place), type(effect)
         held = place in self.sides and self.part.held[place].any()
         hooks = ("added_inertia", *(("dry_friction", "holds") if held else ()))

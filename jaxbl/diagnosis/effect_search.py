@@ -293,7 +293,7 @@ class EffectSearch:
             neutral = _Proposal({name: EFFECTS[name].neutral()})
             if name in self.expected:
                 linear, variants = self._vary(current, [name])
-                ranked = self._rank(linear, current.names, variants, linear.chosen)
+                ranked = self._rank(linear, current.names, variants, linear.best_predictor)
                 trial = self._try(current, ranked[0] if ranked else neutral)
                 stays, reason = self._is_possible(trial.fitted), "known to act"
             else:
@@ -469,7 +469,7 @@ class EffectSearch:
             if variant.name != name or any(getattr(variant.effects[0], leaf) != count for leaf, count in waves.items())
         ]
         trials = list[Trial]()
-        for proposal in self._rank(linear, current.names, suitable, linear.chosen, -np.inf):
+        for proposal in self._rank(linear, current.names, suitable, linear.best_predictor, -np.inf):
             (law,) = proposal.numbers
             fitted = self._try(current, proposal).fitted
             gain = self.gain(fitted, current)
@@ -493,7 +493,7 @@ class EffectSearch:
         """Propose effects that may be missing, most promising first."""
         linear, variants = self._vary(current, [name for name in self.lacking if name not in current.names])
         regression = self._regress(linear, current, variants)
-        ranked = self._rank(linear, current.names, variants, linear.chosen)
+        ranked = self._rank(linear, current.names, variants, linear.best_predictor)
         if ranked:
             # a predictor chosen without an effect makes up for it
             leaders = [linear.choose([proposal.variant]) for proposal in ranked[:_LEADERS]]
@@ -562,14 +562,14 @@ class EffectSearch:
     def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
         """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
         linear = fitted.linear
-        functions, predictor, gained = functions_of(linear.signals), linear.chosen, {}
+        functions, predictor, gained = functions_of(linear.signals), linear.best_predictor, {}
         alone, *models = linear.products(functions, predictor.smoothness, predictor.deviation)
         none = evidence_of(alone)
         for columns in models:
             best = (-np.inf, 0.0)
             for size in _SIZES:
                 scale = columns.scale.copy()
-                scale[columns.shared :] *= size
+                scale[columns.shared_count :] *= size
                 with_function = evidence_of(columns._replace(scale=scale))
                 # columns that are all but alike may have no solution
                 if none is not None and with_function is not None:

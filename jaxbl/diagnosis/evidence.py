@@ -36,7 +36,7 @@ class Products(NamedTuple):
     twins: Mapping[int, tuple[int, float]]
 
     @property
-    def shared(self) -> int:
+    def shared_count(self) -> int:
         """Number of columns that are there without a candidate."""
         return len(self.scale) - self.candidate.width - self.candidate.offset
 
@@ -67,10 +67,10 @@ def evidence_of(columns: Products) -> Evidence | None:
 
 
 def _evidence(c: Products, width: int) -> Evidence | None:
-    """The same with so many of the candidate's columns."""
+    """Find the same with so many of the candidate's columns."""
     fixed = np.array([0, -1] if c.candidate.offset else [0])
     # what has no torque along this record has no coefficient either
-    alive = [k for k in range(1, c.shared + width) if np.isfinite(c.scale[k])]
+    alive = [k for k in range(1, c.shared_count + width) if np.isfinite(c.scale[k])]
     variance, middle = c.scale**2, c.centre.copy()
     joined = [k for k in alive if k in c.twins]
     for k in joined:
@@ -89,8 +89,8 @@ def _evidence(c: Products, width: int) -> Evidence | None:
         of, factor = c.twins[k]
         values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
         values[of] -= factor * values[k]
-    numbers = c.candidate.numbers(values[c.shared : c.shared + c.candidate.width].tolist())
-    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : c.shared])
+    numbers = c.candidate.numbers(values[c.shared_count : c.shared_count + c.candidate.width].tolist())
+    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : c.shared_count])
 
 
 def _solve(

@@ -380,7 +380,7 @@ class Linear:
         return [steps.errors(find_gains(smoothness, self.period), Forces(())) for steps in self.steps]
 
     @cached_property
-    def chosen(self) -> Predictor:
+    def best_predictor(self) -> Predictor:
         """The predictor with the least errors, without candidates."""
         return self.choose(())
 
@@ -427,10 +427,10 @@ class Linear:
         return _peaks(number, np.abs(np.fft.rfft(by_place)) ** 2, few, power, inside, 1)
 
     def _answer(self, i: int, place: str, few: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tell what a torque on a side does to the prediction errors of a part under the :attr:`chosen` predictor, at what
+        """Tell what a torque on a side does to the prediction errors of a part under the :attr:`best_predictor`, at what
         that leaves over: their derivative by the torque at each sample, shape (samples,); and the power of the response to
         waves of `few` periods along a `phase`, shape (waves,)."""
-        steps, side, predictor = self.steps[i], self.sides.index(place), self.chosen
+        steps, side, predictor = self.steps[i], self.sides.index(place), self.best_predictor
         gain, deviation = find_gains(predictor.smoothness, self.period), predictor.deviation
         if not np.isfinite(deviation).all():
             # no predictor follows this model
@@ -502,7 +502,7 @@ class Linear:
             return np.inf
         # the torque of the input once more
         again = Candidate("input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]})
-        _, with_input = self.products([again], self.chosen.smoothness, self.chosen.deviation)
+        _, with_input = self.products([again], self.best_predictor.smoothness, self.best_predictor.deviation)
         return float(np.sqrt(with_input.products[-1, -1]))
 
     def shows(self, name: str, numbers: Numbers) -> bool:

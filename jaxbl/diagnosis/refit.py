@@ -193,7 +193,7 @@ class _Fit:
             near = best.linear.choose((), best.predictor.smoothness).smoothness
             # along the smoothed motion what is chosen does not hang on what was chosen before
             first = [self._choose(best.theta)] if turn == 0 else []
-            options = [*first, best.linear.chosen.smoothness, near]
+            options = [*first, best.linear.best_predictor.smoothness, near]
             points = [
                 self.at(best.theta, best.start, smoothness)
                 for i, smoothness in enumerate(options)
@@ -211,7 +211,7 @@ class _Fit:
 
     def _choose(self, theta: np.ndarray) -> Sequence[float]:
         """Choose the predictor along the smoothed motion."""
-        return Linear(self.experiment, self.free, theta, self.width, self.segments).chosen.smoothness
+        return Linear(self.experiment, self.free, theta, self.width, self.segments).best_predictor.smoothness
 
     def _descend(self, best: FitPoint) -> FitPoint:
         share = 1.0

@@ -142,7 +142,7 @@ def _input_noise(record: Record, model: Experiment, segments: Sequence[Segment])
         return InputNoise(0.0, noise)
     # at the model's numbers: those that may change would absorb some of the noise
     recorded, smooth = (Linear(model, (), np.zeros(0), np.zeros(0), driven) for driven in (segments, quiet(segments, noise)))
-    smoothness = recorded.chosen.smoothness
+    smoothness = recorded.best_predictor.smoothness
     share, error = unfelt(recorded.find_errors_left(smoothness), smooth.find_errors_left(smoothness))
     # nats that it did not feel it, rather than did
     nats = (share - 0.5) / error**2

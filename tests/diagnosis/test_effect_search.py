@@ -178,7 +178,7 @@ def test_a_free_function_without_a_solution_shows_nothing(monkeypatch):
         for candidate, count in ((NO_CANDIDATE, 2), (function, 3))
     ]
     predictor = SimpleNamespace(smoothness=[1.0], deviation=np.ones(1))
-    linear = SimpleNamespace(chosen=predictor, products=lambda *_: models, signals=[])
+    linear = SimpleNamespace(best_predictor=predictor, products=lambda *_: models, signals=[])
     monkeypatch.setattr(effect_search, "functions_of", lambda _: [function])
     search = SimpleNamespace(floor=0.0)
     assert EffectSearch.remainder(search, SimpleNamespace(linear=linear)) == {"motor.time": (-np.inf, 0.0)}  # type: ignore

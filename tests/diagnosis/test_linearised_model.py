@@ -194,7 +194,7 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     begin = end = model_columns
     assert [products.candidate for products in models[1:]] == variants
     for products in models:
-        begin, end = end, end + len(products.scale) - products.shared
+        begin, end = end, end + len(products.scale) - products.shared_count
         point = np.array([*range(model_columns), *range(begin, end)])
         difference = (products.products - expected[np.ix_(point, point)]) / np.outer(size[point], size[point])
         assert np.max(np.abs(difference), where=np.isfinite(difference), initial=0.0) < 1e-9
@@ -254,7 +254,7 @@ def test_what_rounding_takes_is_known(growth):
 
 def test_a_gain_under_which_rounding_would_decide_is_left_out(monkeypatch):
     model = linearise(1)
-    smoothness = model.chosen.smoothness
+    smoothness = model.best_predictor.smoothness
     assert np.isfinite(model.predictor(smoothness).squares).all()
     monkeypatch.setattr(module, "_LOST", 0.0)
     assert not np.isfinite(model.predictor(smoothness).squares).any()
