@@ -221,7 +221,7 @@ def _summary(
         else:
             share = value / float(drive.ratio(name.partition(".")[0])) / size
         finding = Finding(name, chance, numbers[name], ())
-        findings.append(describe_finding(record, finding, errors, {}) | {"share": share})
+        findings.append(describe_finding(record, finding, errors, {}) | {"share": share, "z": max(gains[name], 0.0) ** 0.5})
     notes = list(record.notes)
     notes.append(f"From the motor's encoder alone these effects are sought and no others: {', '.join(search.effects)}.")
     if alone.reason:

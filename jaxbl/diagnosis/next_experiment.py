@@ -229,14 +229,14 @@ def _inputs(record: Record, largest: float, mean: float) -> list[Input]:
     period = record.sample_period
     # gaps of a log are no part of it
     duration = min(sum(part.stop - part.start for part in record.segments) * period, _LONGEST)
-    time = period * np.arange(round(duration / period))
+    time = period * jnp.arange(round(duration / period))
     top = min(0.02 / period, 10.0)
     inputs = []
     for frequency in np.geomspace(min(2.0 / duration, 0.5 * top), top, _FREQUENCIES).tolist():
         waves: dict[str, AbstractExcitation] = {
             "sine": Sine(1.0, frequency),
             "multisine": Multisine(1.0, frequency),
-            "chirp": Chirp(1.0, frequency, _DECADE * frequency, time[-1]),
+            "chirp": Chirp(1.0, frequency, _DECADE * frequency, duration),
             "steps": Prbs(1.0, 0.5 / frequency, _BITS),
         }
         for kind, excitation in waves.items():
