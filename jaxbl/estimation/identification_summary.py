@@ -21,7 +21,7 @@ from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, errors, regress
 from .search import SearchFit, is_noise
 from .segments import at_period, long_enough, reading_noise, segments_of, windows_of
-from .trajectory import Fit, projected_residual
+from .trajectory import Fit, eliminate_starts
 
 
 def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
@@ -42,7 +42,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     segments = segments_of(record, nominal.sides, at_rest)
     noise = reading_noise(segments)
     windows, _ = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
-    left = [projected_residual(model, windows)[0] for model in rebased]
+    left = [eliminate_starts(model, windows).residual for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
         before, after = (noise[side] * rms(residual[:, :, i]) for residual in left)

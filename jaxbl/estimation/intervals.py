@@ -15,7 +15,7 @@ from scipy.special import chdtri, ndtri
 
 from jaxbl.chain import Experiment
 
-from .free_parameters import FreeParameter
+from .free_parameters import FreeParameter, set_free_parameters
 from .trajectory import Fit, Windows, fit
 
 _Points = list[tuple[float, float]]
@@ -196,11 +196,12 @@ def profile(
         for _ in range(_PASSES):
             step = min(step, _FURTHEST)
             theta = centre + sign * step * direction
-            end = fit(experiment, free, windows, theta, _MOST_STEPS, np.arange(len(free)) == i)
+            model = set_free_parameters(experiment, [free[i]._replace(minimum=None)], theta[[i]])
+            end = fit(model, [*free[:i], *free[i + 1 :]], windows, np.delete(theta, i), _MOST_STEPS)
             deviance = 2.0 * (end.cost - best.cost) / worth[i]
             points.append((float(step), float(deviance)))
             # the next fit starts where this one ended
-            direction = (end.theta - centre) / (sign * step)
+            direction = (np.insert(end.theta, i, theta[i]) - centre) / (sign * step)
             with np.errstate(divide="ignore", invalid="ignore"):
                 factor = np.sqrt(LIMIT / np.maximum(deviance, 0.0))
             step *= np.clip(factor if np.isfinite(factor) else 0.3, 0.3, 3.0)

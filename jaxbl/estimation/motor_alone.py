@@ -184,7 +184,7 @@ def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collec
     windows = cut(torque, {}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque))
     residual = (point.errors / model.noise)[None, :, None]
     none = np.zeros((*residual.shape, 0))
-    fit = Fit(point.theta[visible], windows.start, residual, none, 0.5 * np.sum(residual**2), True)
+    fit = Fit(point.theta[visible], windows.start, residual, none, True)
     return SearchFit(
         free=tuple(model.free[i] for i in visible), fit=fit,
         spread=width.only(visible)._replace(variance=point.variance / model.noise**2),

@@ -6,17 +6,16 @@ than a tenth of their standard errors, what finer steps add to the positions is 
 Reference: H. Stetter, The defect correction principle and discretization methods, Numer. Math. 29 (1978).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from jaxbl.chain import Experiment
-from jaxbl.drive.parameters import set_leaves
 
-from .free_parameters import PRIOR_DEVIATION, FreeParameter
+from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 from .intervals import spread
-from .trajectory import Fit, Windows, positions_over_noise, simulate_windows
+from .trajectory import Fit, Windows, fit, positions_over_noise, simulate_windows
 
 _SHARE = 0.1
 """Of a standard error that twice as many steps may change a number: coverage of 95 % falls by 0.1 % then."""
@@ -31,11 +30,7 @@ _FITS = 3
 
 
 def refine_steps(
-    experiment: Experiment,
-    free: Sequence[FreeParameter],
-    windows: Windows,
-    fit: Fit,
-    fit_again: Callable[[Windows, Fit], Fit],
+    experiment: Experiment, free: Sequence[FreeParameter], windows: Windows, first: Fit
 ) -> tuple[Windows, Fit, Sequence[np.ndarray], int]:
     """Refine the plant steps of a fit until twice as many change no number by a tenth of its standard error.
 
@@ -43,48 +38,45 @@ def refine_steps(
         experiment: the nominal model, with the study's steps.
         free: numbers that were fitted.
         windows: the record.
-        fit: with the study's steps.
-        fit_again: fits to changed windows, from where a fit ended.
+        first: fit with the study's steps.
 
     Returns:
         Windows and fit with finer steps, or as they were if these make the log less likely; errors of theta that remain,
         each of shape (parameters,); and plant steps in a sample.
     """
-    study_windows, first, change, left, excess = windows, fit, np.zeros(len(free)), np.zeros(len(free)), 0.0
+    study_windows, best, change, left, excess = windows, first, np.zeros(len(free)), np.zeros(len(free)), 0.0
     steps = study_steps = experiment.run.substeps
     for fits_left in reversed(range(_FITS)):
-        theta, deviation = fit.theta, np.sqrt(np.diag(spread(fit).covariance))
-        model = set_leaves(
-            experiment, {parameter.path: np.asarray(parameter.value(theta[i])) for i, parameter in enumerate(free)}
-        )
-        jacobian = fit.jacobian.reshape(-1, len(free))
+        deviation = np.sqrt(np.diag(spread(best).covariance))
+        model = set_free_parameters(experiment, free, best.theta)
+        jacobian = best.jacobian.reshape(-1, len(free))
         normal = jacobian.T @ jacobian + np.eye(len(free)) / PRIOR_DEVIATION**2
         # of what diverges nothing is finite, and finer steps are of no help
         with np.errstate(all="ignore"):
-            coarse = fine = _simulate(model, windows, fit, study_steps)
+            coarse = fine = _simulate(model, windows, best, study_steps)
             while True:
-                half = _simulate(model, windows, fit, 2 * steps)
+                half = _simulate(model, windows, best, 2 * steps)
                 left = np.linalg.solve(normal, jacobian.T @ (half - fine).ravel())
                 excess = float(np.max(np.abs(left) / deviation)) / _SHARE
                 if not excess > 1.0 or steps >= _MOST:
                     break
                 # errors fall with the square of the steps
                 steps = min(steps * 2 ** int(np.ceil(0.5 * np.log2(excess) + 1e-9)), _MOST)
-                fine = _simulate(model, windows, fit, steps)
+                fine = _simulate(model, windows, best, steps)
         if steps == study_steps:
-            return windows, fit, [], steps
+            return windows, best, [], steps
         finer = half - coarse
         change = np.linalg.solve(normal, jacobian.T @ (finer - windows.finer).ravel())
         windows = replace(windows, finer=finer)
         if np.all(np.abs(change) < _LINEAR * deviation):
-            fit, change = fit._replace(theta=theta + change), np.zeros(len(free))
+            best, change = best._replace(theta=best.theta + change), np.zeros(len(free))
             break
         if fits_left:
-            fit = fit_again(windows, fit)
-            if not float(fit.cost - first.cost) < _LESS_LIKELY * spread(first).variance:
+            best = fit(experiment, free, windows, best.theta)
+            if not best.cost - first.cost < _LESS_LIKELY * spread(first).variance:
                 return study_windows, first, [change], study_steps
     # by the order of the steps, a third of the last change is left
-    return windows, fit, [change, left / 3.0] if excess > 1.0 else [change], 2 * steps
+    return windows, best, [change, left / 3.0] if excess > 1.0 else [change], 2 * steps
 
 
 def _simulate(model: Experiment, windows: Windows, fit: Fit, steps: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_are
 from jaxbl.chain import Experiment, NamedArrays
 from jaxbl.drive.effects import Numbers
 
-from .trajectory import Windows, projected_residual
+from .trajectory import Windows, eliminate_starts
 
 _COARSE = 10.0 ** np.arange(-12.0, 1.0)
 """Smoothness q h^3 / sigma^2 tried for all sides alike, from a free run to following every reading."""
@@ -38,7 +38,7 @@ def kalman_gain(smoothness: float, period: float) -> np.ndarray:
 
 def _sizes(experiment: Experiment, windows: Windows, gain: NamedArrays) -> np.ndarray:
     """Rms prediction error of each side in rad under a gain."""
-    residual, _ = projected_residual(experiment, replace(windows, gain=gain))
+    residual = eliminate_starts(experiment, replace(windows, gain=gain)).residual
     return np.array([windows.noise[side] for side in experiment.sides]) * np.sqrt(np.mean(residual**2, axis=(0, 1)))
 
 

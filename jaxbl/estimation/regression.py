@@ -365,4 +365,4 @@ def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequen
             lambda point: _SETTLED * point.deviance,
         )
     residual, slope = best.residual[None], best.slope[None]
-    return Fit(best.theta, PlantState({}, {}, ()), residual, slope, 0.5 * np.sum(residual**2), ended)
+    return Fit(best.theta, PlantState({}, {}, ()), residual, slope, ended)

@@ -140,17 +140,16 @@ class ParameterSearch:
             InputError: the model diverges, or windows are of a length that the log does not allow.
         """
         theta, starts = self._coarse(free)
-        fitted = np.ones(len(free), bool)
-        best = self._whole(free, theta, fitted)
+        best = self._whole(free, theta)
         refused, condition = refusals(best.free, best.spread)
         held, left = [], refused
-        while left and len(best.free) > 1:
+        while left and len(free) > 1:
             worst = max(left, key=lambda refusal: refusal.deviation)
             out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
             held.append(out)
-            fitted &= np.array([parameter.path != out for parameter in free])
-            theta = np.where(fitted, theta, 0.0)
-            best = self._whole(free, theta, fitted)
+            kept = np.array([parameter.path != out for parameter in free])
+            free, theta = tuple(itertools.compress(free, kept)), theta[kept]
+            best = self._whole(free, theta)
             left, _ = refusals(best.free, best.spread)
         return SearchFit(**vars(best), refused=refused, held=held, condition=condition, starts=starts)
 
@@ -180,18 +179,8 @@ class ParameterSearch:
         same = cost[best] + 0.01 * max(cost[best], tries[best].residual.size / 2)
         return _nearest_turn(free, tries[best].theta), (cost <= same).tolist()
 
-    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray, fitted: np.ndarray) -> Fitted:
+    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray) -> Fitted:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
-
-        def fit_again(windows: Windows, fit: Fit) -> Fit:
-            start = theta.copy()
-            start[fitted] = fit.theta
-            return fit_from(windows, start).only(np.flatnonzero(fitted))
-
-        def fit_from(windows: Windows, start: np.ndarray) -> Fit:
-            return fit(self.experiment, free, windows, start, held=~fitted)
-
-        left = tuple(itertools.compress(free, fitted))
         sized: list[tuple[float, Fitted]] = []
         for samples in self.lengths:
             windows, firsts = self._cut(samples)
@@ -199,13 +188,13 @@ class ParameterSearch:
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
                     windows, smoothness = predictor(set_free_parameters(self.experiment, free, theta), windows)
-                    theta = fit_from(windows, theta).theta
-            end = fit_from(windows, theta).only(np.flatnonzero(fitted))
-            windows, end, errors, steps = refine_steps(self.experiment, left, windows, end, fit_again)
+                    theta = fit(self.experiment, free, windows, theta).theta
+            end = fit(self.experiment, free, windows, theta)
+            windows, end, errors, steps = refine_steps(self.experiment, free, windows, end)
             width = spread(end).with_error(*errors)
             size = float(np.sum(np.log(np.diag(width.covariance))))
             if np.isfinite(size):
-                sized.append((size, Fitted(left, end, width, windows, firsts, smoothness, steps, errors)))
+                sized.append((size, Fitted(free, end, width, windows, firsts, smoothness, steps, errors)))
         if not sized:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
         growth = sized[-1][1].spread.variance / sized[0][1].spread.variance - 1.0

@@ -19,11 +19,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbl.chain import Experiment, PlantState, correct_by_readings
-from jaxbl.drive.parameters import set_leaves
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
 
 from .descent import descend, linearise
-from .free_parameters import PRIOR_DEVIATION, FreeParameter
+from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 
 Residuals = Float[np.ndarray, "windows samples sides"]
 """Of positions over the noise."""
@@ -97,7 +96,6 @@ class Fit(NamedTuple):
         residual: measured minus simulated position over the noise, shape (windows, samples, sides).
         jacobian: its derivative by theta, what initial states could explain projected out;
             shape (windows, samples, sides, parameters).
-        cost: half the sum of squared residuals.
         converged: whether the solver met its tolerance.
     """
 
@@ -105,12 +103,13 @@ class Fit(NamedTuple):
     start: PlantState
     residual: Residuals
     jacobian: Float[np.ndarray, "windows samples sides parameters"]
-    cost: float | np.floating
     converged: bool
 
-    def only(self, places: np.ndarray) -> "Fit":
-        """Some of the numbers; the others were held."""
-        return self._replace(theta=self.theta[places], jacobian=self.jacobian[..., places])
+    @property
+    @np.errstate(over="ignore")
+    def cost(self) -> float:
+        """Half the sum of squared residuals."""
+        return 0.5 * float(np.sum(self.residual**2))
 
 
 def simulate_windows(experiment: Experiment, windows: Windows, start: PlantState) -> PlantState:
@@ -253,13 +252,13 @@ def over_size(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return flat / size[:, None], size
 
 
-class _Eliminated(NamedTuple):
+class Eliminated(NamedTuple):
     """Windows from the initial states that suit them.
 
     Attributes:
         states: along the windows, leaves of shape (windows, samples).
         basis: orthonormal, of what their initial states can explain; shape (windows, samples times sides, states).
-        residual: without that, shape (windows, samples, sides).
+        residual: over the noise without that, shape (windows, samples, sides).
     """
 
     states: PlantState
@@ -272,36 +271,20 @@ class _Eliminated(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[:, 0], self.states)
 
 
-def _eliminate(experiment: Experiment, windows: Windows, passes: int, at_rest: bool) -> _Eliminated:
-    """Seek the initial states of windows, and a basis of what they can explain."""
+@np.errstate(all="ignore")
+def eliminate_starts(experiment: Experiment, windows: Windows, passes: int = _OUTER, at_rest: bool = True) -> Eliminated:
+    """Seek the initial states of windows, and a basis of what they can explain; arguments as of :func:`seek_starts`."""
     starts = seek_starts(experiment, windows, passes, at_rest)
     unit, size = over_size(starts.slope)
     # of a column of zeros the decomposition makes any direction
     basis = np.where(np.isfinite(size)[:, None], np.linalg.qr(unit)[0], 0.0)
-    return _Eliminated(starts.states, basis, _without(basis, starts.residual))
-
-
-def _choose(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """Take the new rows where they are chosen."""
-    return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    return Eliminated(starts.states, basis, _without(basis, starts.residual))
 
 
 def _without(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the part of values, shape (windows, samples, sides, ...), outside the windows' bases."""
     flat = values.reshape(*basis.shape[:2], -1)
     return (flat - basis @ (basis.swapaxes(1, 2) @ flat)).reshape(values.shape)
-
-
-@np.errstate(all="ignore")
-def projected_residual(
-    experiment: Experiment, windows: Windows, passes: int = _OUTER, at_rest: bool = True
-) -> tuple[np.ndarray, PlantState]:
-    """Residuals over the noise without what the windows' initial states could explain, and those states.
-
-    Of each window's initial state `passes` values are tried, with `at_rest` standstill among them.
-    """
-    eliminated = _eliminate(experiment, windows, passes, at_rest)
-    return eliminated.residual, eliminated.start
 
 
 class _Point(NamedTuple):
@@ -316,7 +299,7 @@ class _Point(NamedTuple):
 
     theta: np.ndarray
     model: Experiment
-    eliminated: _Eliminated
+    eliminated: Eliminated
     deviance: float
 
     @property
@@ -332,7 +315,6 @@ def fit(
     windows: Windows,
     theta: np.ndarray,
     most_steps: int = 100,
-    held: np.ndarray | None = None,
     rounds: int = 3,
 ) -> Fit:
     """Fit from one start.
@@ -345,18 +327,16 @@ def fit(
         windows: the record.
         theta: the start, shape (parameters,); zeros are the nominal values.
         most_steps: of each descent.
-        held: which numbers stay at the start, shape (parameters,); none if left out.
-        rounds: descents at most, again where initial states sought anew are better ones.
+        rounds: descents at most, again where initial states sought anew are better ones; one is not followed by a search.
     """
-    moving = np.ones(len(theta)) if held is None else np.where(held, 0.0, 1.0)
     precision, count = np.full(len(theta), PRIOR_DEVIATION**-2.0), windows.torque.size * len(windows.measured)
+    # through zero, so that what is 0 is found without bias
+    unbounded = [number._replace(minimum=None) for number in free]
 
     def evaluate(theta: np.ndarray, start: PlantState, passes: int = _INNER, at_rest: bool = False) -> _Point:
-        # through zero, so that what is 0 is found without bias
-        numbers = {number.path: number._replace(minimum=None).value(x) for number, x in zip(free, theta, strict=True)}
-        model = set_leaves(experiment, jax.tree.map(np.asarray, numbers))
-        eliminated = _eliminate(model, replace(windows, start=start), passes, at_rest)
-        squares = float(np.sum(eliminated.residual**2) + np.sum(precision * (moving * theta) ** 2))
+        model = set_free_parameters(experiment, unbounded, theta)
+        eliminated = eliminate_starts(model, replace(windows, start=start), passes, at_rest)
+        squares = float(np.sum(eliminated.residual**2) + np.sum(precision * theta**2))
         return _Point(theta, model, eliminated, squares if np.isfinite(squares) else np.inf)
 
     def slope(point: _Point) -> np.ndarray:
@@ -364,28 +344,25 @@ def fit(
         slopes = _differentiate(point.model, free, point.theta, windows, point.eliminated.states)
         return _without(point.eliminated.basis, slopes[..., : len(free)])
 
-    best, converged = None, False
-    for turn in range(rounds + 1):
-        # a window's initial state may be the best of its neighbourhood only: they are sought anew, from the guess
-        anew = evaluate(np.asarray(theta, float) if best is None else best.theta, windows.start, _OUTER, True)
-        if best is not None:
-            gains = best.squares - anew.squares
-            start = jax.tree.map(partial(_choose, gains > 0.0), anew.eliminated.start, best.eliminated.start)
-            best = evaluate(best.theta, start)
-            if turn == rounds or not np.any(gains > _GAINED * np.sum(best.squares) / count):
-                break
+    best, converged = evaluate(np.asarray(theta, float), windows.start, _OUTER, True), False
+    for _ in range(rounds):
         best, converged = descend(
-            best or anew,
-            lambda point: linearise(point.eliminated.residual, moving * slope(point), moving * point.theta, precision),
+            best,
+            lambda point: linearise(point.eliminated.residual, slope(point), point.theta, precision),
             lambda point, change: evaluate(point.theta + change, point.eliminated.start),
             most_steps,
             lambda point: _ENOUGH * point.deviance / count,
         )
         if rounds == 1:
             break
-    assert best is not None
-    residual = best.eliminated.residual
-    return Fit(best.theta, best.eliminated.start, residual, slope(best), 0.5 * np.sum(residual**2), converged)
+        # a window's initial state may be the best of its neighbourhood only: they are sought anew, from the guess
+        anew = evaluate(best.theta, windows.start, _OUTER, True)
+        gains = best.squares - anew.squares
+        start = jax.tree.map(partial(np.where, gains > 0.0), anew.eliminated.start, best.eliminated.start)
+        best = evaluate(best.theta, start)
+        if not np.any(gains > _GAINED * np.sum(best.squares) / count):
+            break
+    return Fit(best.theta, best.eliminated.start, best.eliminated.residual, slope(best), converged)
 
 
 def cut(

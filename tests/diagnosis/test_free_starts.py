@@ -15,7 +15,7 @@ from jaxbl.diagnosis.neutral_effects import with_torques
 from jaxbl.drive import make_effect
 from jaxbl.drive.parameters import as_arrays, set_leaves
 from jaxbl.estimation.segments import segments_of, windows_of
-from jaxbl.estimation.trajectory import projected_residual
+from jaxbl.estimation.trajectory import eliminate_starts
 
 STUDY = multisine_study(
     2.0,
@@ -42,11 +42,11 @@ def test_runs_are_those_of_the_fit(log, from_rest):
         measured={side: readings[:, :seen] for side, readings in windows.measured.items()},
         finer=windows.finer[:, :seen],
     )
-    expected, start = projected_residual(model, first, 8, from_rest)
+    expected = eliminate_starts(model, first, 8, from_rest)
     assert actual.residual.shape == (8, 250, 2) and seen == 50
-    assert np.sqrt(np.mean(np.square(expected))) > 1.05
-    assert actual.residual[:, :seen] == pytest.approx(np.asarray(expected), rel=1e-5, abs=1e-5)
-    for actual_start, expected_start in zip(jax.tree.leaves(actual.states), jax.tree.leaves(start), strict=True):
+    assert np.sqrt(np.mean(np.square(expected.residual))) > 1.05
+    assert actual.residual[:, :seen] == pytest.approx(np.asarray(expected.residual), rel=1e-5, abs=1e-5)
+    for actual_start, expected_start in zip(jax.tree.leaves(actual.states), jax.tree.leaves(expected.start), strict=True):
         assert actual_start[:, 0] == pytest.approx(np.asarray(expected_start), rel=1e-4, abs=1e-6)
 
 

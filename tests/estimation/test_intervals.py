@@ -7,6 +7,7 @@ from scipy.optimize import brentq
 from small_study import rigid_study
 
 from jaxbl.config import prepare, read_config
+from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import interval, profile, spread
@@ -62,8 +63,8 @@ def test_where_it_is_not_the_profile_follows_the_likelihood():
     scale = float(width.variance) * float(width.inflation[1]) ** 2
 
     def excess_cost(value):
-        theta = np.array([result.theta[0], np.log(value / 0.15)])
-        bound_fit = fit(experiment, free, windows, theta, 60, np.array([False, True]))
+        bound = set_leaves(experiment, {paths[1]: value})
+        bound_fit = fit(bound, free[:1], windows, result.theta[:1], 60)
         return 2.0 * (float(bound_fit.cost) - float(result.cost)) / scale - 3.841
 
     best = 0.15 * np.exp(float(result.theta[1]))

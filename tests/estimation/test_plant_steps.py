@@ -35,9 +35,7 @@ def refine(noise, made_with, steps=2):
     free = make_free_parameters(experiment, PATHS, 1.0)
 
     first = fit(experiment, free, windows, np.zeros(3))
-    _, refined, errors, steps = refine_steps(
-        experiment, free, windows, first, lambda windows, fitted: fit(experiment, free, windows, fitted.theta)
-    )
+    _, refined, errors, steps = refine_steps(experiment, free, windows, first)
     deviation = np.sqrt(np.diag(spread(refined).with_error(*errors).covariance))
     away = [
         np.array([one.value(x) for one, x in zip(free, np.asarray(each.theta), strict=True)]) for each in (first, refined)
