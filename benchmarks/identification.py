@@ -36,7 +36,8 @@ from jaxbl.drive.parameters import set_leaves  # noqa: E402
 from jaxbl.estimation import identify as identify_module, log_columns  # noqa: E402
 from jaxbl.estimation.free_parameters import make_free_parameters  # noqa: E402
 from jaxbl.estimation.intervals import spread  # noqa: E402
-from jaxbl.estimation.logs import arrays, gains_for, on_record  # noqa: E402
+from jaxbl.estimation.logs import arrays, on_record  # noqa: E402
+from jaxbl.estimation.observer_gains import gains_for  # noqa: E402
 from jaxbl.estimation.regression import errors, regress  # noqa: E402
 from jaxbl.estimation.search import ParameterSearch  # noqa: E402
 from jaxbl.estimation.segments import segments_of  # noqa: E402

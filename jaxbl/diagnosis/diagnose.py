@@ -15,7 +15,8 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.estimation.feedback_bias import find_feedback_bias
 from jaxbl.estimation.free_parameters import free_values
-from jaxbl.estimation.logs import Logs, arrays, gains_for
+from jaxbl.estimation.logs import Logs, arrays
+from jaxbl.estimation.observer_gains import gains_for
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import POSITION_CHANNELS, Record

@@ -27,8 +27,9 @@ from .free_parameters import FreeParameter, free_values, make_free_parameters
 from .identification_summary import by_regression, by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, note_damping, observer_chain
-from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, gains_for, on_record, read_with_holdout
+from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, on_record, read_with_holdout
 from .motor_alone import alone_on_holdout, columns_alone, gap_summary, search_alone
+from .observer_gains import gains_for
 from .regression import find_motion_share, remembers_input
 from .search import ParameterSearch
 from .segments import Segment, long_enough, segments_of, signal_sizes, skip_unknown_input

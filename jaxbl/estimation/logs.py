@@ -25,8 +25,6 @@ from jaxbl.records.signal_quality import segments_before
 from jaxbl.records.table import TorqueTable
 
 from .free_parameters import PLANT_TABLES
-from .observer_gains import ChosenGains, choose_gains
-from .segments import Segment
 
 Logs = str | Path | Record | Sequence[str | Path | Record]
 
@@ -344,18 +342,3 @@ def decimation(config: Config, record: Record) -> int:
     if bandwidth is None:
         return 10
     return max(round(0.5 / (bandwidth * record.sample_period)), 1)
-
-
-def gains_for(
-    missing: frozenset[str], fitted: Experiment, segments: Sequence[Segment]
-) -> tuple[dict[str, ChosenGains], dict[str, float]]:
-    """Gains of the observers that the study leaves open, by side and by dotted path, chosen on the longest segment."""
-    sides = [side for side in fitted.sides if f"observer.{side}" in missing]
-    if not sides:
-        return {}, {}
-    longest = max(segments, key=len)
-    chosen = choose_gains(fitted, longest.kinematics, longest.readings)
-    values = {}
-    for side in sides:
-        values |= {f"observer.{side}.lambda": chosen[side].lambda_, f"observer.{side}.alpha": chosen[side].alpha}
-    return {side: chosen[side] for side in sides}, values

@@ -5,18 +5,19 @@ once, and those are taken whose velocity comes nearest to the smoothed one, of t
 convergence condition (:func:`jaxbl.observer.conditions.least_lambda_exact`) for the largest disturbance seen.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxbl.chain import Experiment, Signals, State, TracedArrays, replay
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.fused.compilation import jit
 
 from .regression import Kinematics
+from .segments import Segment
 
 _ALPHA = np.geomspace(1.1, 6.0, 10)
 """Tried, over the largest disturbance: alpha must exceed it."""
@@ -66,12 +67,16 @@ def _misses(experiment: Experiment, kinematics: Kinematics, gains: TracedArrays,
     return jax.vmap(miss)(gains)
 
 
-def choose_gains(
-    experiment: Experiment, kinematics: Kinematics, measured: dict[str, Float[Array, " samples"]]
-) -> dict[str, ChosenGains]:
-    """Choose the gains of all observers on a part of a record, by the smoother's kinematics and the positions in rad."""
-    count = min(len(kinematics.time), _MOST)
-    k = jax.tree.map(lambda x: x[:count], kinematics)
+def gains_for(
+    missing: frozenset[str], experiment: Experiment, segments: Sequence[Segment]
+) -> tuple[dict[str, ChosenGains], dict[str, float]]:
+    """Gains of the observers that the study leaves open (`missing`), by side and by dotted path, chosen on the longest
+    segment of a log."""
+    sides = [side for side in experiment.sides if f"observer.{side}" in missing]
+    if not sides:
+        return {}, {}
+    part = max(segments, key=len)[:_MOST]
+    k, count = part.kinematics, len(part)
     ends = slice(min(20, count // 10), count - min(20, count // 10))
     (alpha, factor), least = (x.ravel() for x in np.meshgrid(_ALPHA, _LAMBDA)), np.tile(_LEAST_LAMBDA, len(_LAMBDA))
     # of NumPy: arithmetic alone is no program then
@@ -82,17 +87,17 @@ def choose_gains(
         disturbance = k.acceleration[side] - drive.acceleration(side, k.velocity[side], k.torque)
         f_plus[side] = float(np.max(np.abs(disturbance[ends])))
         bound = max(f_plus[side], np.finfo(float).tiny)
-        candidates[f"observer.{side}.alpha"] = alpha * bound
         candidates[f"observer.{side}.lambda"] = factor * least * np.sqrt(bound)
+        candidates[f"observer.{side}.alpha"] = alpha * bound
 
-    readings = {side: np.asarray(measured[side])[:count] for side in experiment.sides}
-    missed = _misses(experiment, k, candidates, readings)
-    chosen = {}
-    for side in experiment.sides:
+    missed = _misses(experiment, k, candidates, part.readings)
+    gains, values = {}, {}
+    for side in sides:
         size = np.asarray(missed[side])
         size = np.where(np.isfinite(size), size, np.inf)
         # several do exactly the same where noise is fine: the first of them, whatever rounding says
         best = int(np.argmax(size <= (1.0 + 1e-9) * np.min(size)))
-        lambda_, alpha_ = (float(candidates[f"observer.{side}.{name}"][best]) for name in ("lambda", "alpha"))
-        chosen[side] = ChosenGains(lambda_, alpha_, f_plus[side], float(size[best]))
-    return chosen
+        chosen = {path: float(column[best]) for path, column in candidates.items() if path.startswith(f"observer.{side}.")}
+        gains[side] = ChosenGains(*chosen.values(), f_plus[side], float(size[best]))
+        values |= chosen
+    return gains, values
