@@ -78,13 +78,11 @@ def kinematics_from(
     shape (samples, 3). `before`: input before the first sample, N m, shape (earlier,), where it is known.
     """
     earlier = 0 if before is None else len(before)
-    held = np.asarray(torque if before is None else np.concatenate([before, torque]), float)
-    mean = 0.5 * (np.concatenate([held[:1], held[:-1]]) + held)
-    position, velocity, acceleration = (
-        {side: np.ascontiguousarray(np.asarray(state)[:, i]) for side, state in states.items()} for i in range(3)
-    )
-    measured = None if transmitted is None else np.asarray(transmitted)
-    arrays: list[Any] = [np.asarray(time), mean[earlier:], position, velocity, acceleration, measured]
+    held = torque if before is None else np.concatenate([before, torque])
+    mean = 0.5 * (np.append(held[:1], held[:-1]) + held)
+    motion: list[Any] = [{side: np.ascontiguousarray(state[:, i]) for side, state in states.items()} for i in range(3)]
+    # arrays of numpy go where those of jax are asked for
+    arrays: list[Any] = [time, mean[earlier:], *motion, transmitted]
     return Kinematics(*arrays, before=mean[:earlier] if earlier else None)  # pyright: ignore[reportArgumentType]
 
 
@@ -310,11 +308,6 @@ def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray
     return np.array([np.mean(part**2) for part in np.array_split(torque, _BLOCKS)]) - left
 
 
-def shortest(factor: int) -> int:
-    """Samples that a part must have to be decimated."""
-    return 1 if factor == 1 else 20 * factor + 1
-
-
 class _Point(NamedTuple):
     """Torques that are left over at a theta, weighted, shape (samples, equations), their derivative, and their squares."""
 
@@ -342,7 +335,7 @@ def _miss_torques(
 def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int) -> Fit:
     """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
 
-    Parts shorter than :func:`shortest` for this decimation must be left out. Residuals and derivatives of the fit have shape
+    Parts shorter than the filter of :func:`decimate` must be left out. Residuals and derivatives of the fit have shape
     (1, samples, equations, ...), for :func:`jaxbl.estimation.intervals.spread`.
     """
     precision = np.full(len(free), PRIOR_DEVIATION**-2.0)

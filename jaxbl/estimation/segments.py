@@ -21,12 +21,13 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
 from .free_parameters import SignalSizes
-from .regression import Kinematics, Path, effect_states, kinematics_from, shortest
+from .regression import Kinematics, Path, effect_states, kinematics_from
 from .smoother import Smoothed, smooth
 from .trajectory import Windows, cut
 
 _FEWEST = 50
-"""Samples of a segment whose torques are compared: the smoother's ends, some ten samples each, are then a small part."""
+"""Samples of a segment whose torques are compared: the smoother's ends, some ten samples each, are then a small part. Where
+torques are decimated, twice as many as the filter takes."""
 _LONG = 10
 """Least length of a segment that gives up its beginning, over what it gives up: it loses a tenth at most."""
 
@@ -62,9 +63,7 @@ class Segment:
         """Some of its samples, in a row."""
         first = part.start or 0
         smoothed = {
-            side: motion._replace(
-                state=motion.state[part], covariance=motion.covariance[part], innovations=motion.innovations[part]
-            )
+            side: motion._replace(state=motion.state[part], covariance=motion.covariance[part])
             for side, motion in self.smoothed.items()
         }
         readings = {side: values[part] for side, values in self.readings.items()}
@@ -143,7 +142,7 @@ def signal_sizes(experiment: Experiment, segments: Sequence[Segment]) -> SignalS
 
 def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
     """Kinematics of the segments that are long enough to be decimated by a factor."""
-    return [segment.kinematics for segment in segments if len(segment) >= max(2 * shortest(factor), _FEWEST)]
+    return [segment.kinematics for segment in segments if len(segment) >= max(2 * (20 * factor + 1), _FEWEST)]
 
 
 @jit

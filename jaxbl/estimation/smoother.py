@@ -42,14 +42,12 @@ class Smoothed(NamedTuple):
         covariance: shape (samples, 3, 3), of the reading noise and of what the jerk's noise leaves open.
         noise: standard deviation of the position readings, rad.
         jerk: spectral density q of the jerk, rad^2/s^5.
-        innovations: one-step prediction errors over their standard deviations; white where the model holds.
     """
 
     state: Float[np.ndarray, "samples 3"]
     covariance: Float[np.ndarray, "samples 3 3"]
     noise: float | np.floating
     jerk: float | np.floating
-    innovations: Signal
 
     @property
     def position(self) -> Signal:
@@ -187,23 +185,11 @@ def _unit(position: Any) -> Any:
     return np.maximum(guess, 1e-9 * np.ptp(position) + np.finfo(position.dtype).tiny)
 
 
-def _passes(scaled: Any, smoothness: Any) -> tuple[Arrays, Arrays]:
+def _passes(scaled: Any, smoothness: Any) -> Arrays:
     """Run filter and backward pass along a position, or along several side by side, from the first sample on."""
     zero = 0.0 * scaled[0]
     forward = _along(_predict, [smoothness + zero], _first(scaled, smoothness), [scaled])
-    return forward, [column[::-1] for column in _along(_correct, [], [zero] * 9, [column[::-1] for column in forward])]
-
-
-def _run_smoother(position: Any, smoothness: Any, noise: Any, period: Any) -> Smoothed:
-    forward, columns = _passes((position - position[0]) / noise, smoothness)
-    unit = np.stack([noise, noise / period, noise / period**2])
-    state = np.stack(columns[:3], axis=1) * unit[None, :]
-    # the position counts from the first one
-    state = np.concatenate([state[:, :1] + position[0], state[:, 1:]], axis=1)
-    covariance = np.stack([np.stack([columns[3 + i] for i in row], axis=1) for row in _FULL], axis=1)
-    innovations = forward[9] / np.sqrt(forward[10])
-    jerk = smoothness * noise**2 / period**5
-    return Smoothed(state, covariance * np.outer(unit, unit)[None], noise, jerk, innovations)
+    return [column[::-1] for column in _along(_correct, [], [zero] * 9, [column[::-1] for column in forward])]
 
 
 def _fit(position: np.ndarray) -> tuple[Any, Any]:
@@ -242,7 +228,13 @@ def smooth(position: Signal, period: float, *, noise_and_jerk: tuple[Any, Any] |
         else:
             sigma, jerk = (np.float64(number) for number in noise_and_jerk)
             smoothness = jerk * h**5 / sigma**2
-        return _run_smoother(values, smoothness, sigma, h)
+        columns = np.stack(_passes((values - values[0]) / sigma, smoothness), axis=1)
+        unit = np.stack([sigma, sigma / h, sigma / h**2])
+        state = columns[:, :3] * unit
+        # the position counts from the first one
+        state[:, 0] += values[0]
+        covariance = columns[:, 3:][:, _FULL] * np.outer(unit, unit)
+        return Smoothed(state, covariance, sigma, smoothness * sigma**2 / h**5)
 
 
 def smoothed_accelerations(positions: Signals, period: float, noise_and_jerk: tuple[Any, Any]) -> Signals:
@@ -252,6 +244,6 @@ def smoothed_accelerations(positions: Signals, period: float, noise_and_jerk: tu
     with np.errstate(all="ignore"):
         for first in range(0, positions.shape[1], _TOGETHER):
             channels = positions[:, first : first + _TOGETHER]
-            _, columns = _passes((channels - channels[0]) / sigma, smoothness)
-            accelerations[:, first : first + _TOGETHER] = columns[2] * sigma / period**2
+            acceleration = _passes((channels - channels[0]) / sigma, smoothness)[2]
+            accelerations[:, first : first + _TOGETHER] = acceleration * sigma / period**2
     return accelerations
