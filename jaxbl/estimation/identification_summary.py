@@ -26,7 +26,7 @@ from .trajectory import Fit, eliminate_starts
 
 def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
     """Measure how far a model misses the torques of a log after decimation, by equation, with units."""
-    equations = errors(experiment, parts, factor) if parts else {}
+    equations = errors(experiment, parts, factor)
     return {name: figures | {"unit": record.unit_of(name, "N m")} for name, figures in equations.items()}
 
 
