@@ -1,7 +1,5 @@
 """A transmission alone on a test rig, from its log: what `jaxbl identify` does where `[log] kind` is `element`."""
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,7 +17,7 @@ from jaxbl.records import LogTable, Record, check_positions, read_log_table, rea
 from jaxbl.records.element import Element, element_error
 from jaxbl.records.inspection import compute_twist, fit_record_element, make_rig_log
 
-from .logs import SealedRecord
+from .logs import SealedRecord, hash_task
 
 _PATHS = {
     "stiffness": "transmission.stiffness",
@@ -48,14 +46,12 @@ class ElementTask:
     table: LogTable
     gear_ratio: float | None
     record: Record
-    holdout: Record | None
+    holdout: SealedRecord | None
 
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = json.dumps([self.table.model_dump(), self.gear_ratio, version("jaxbl")], sort_keys=True)
-        hashes = [SealedRecord(record).hash for record in (self.record, self.holdout) if record is not None]
-        return hashlib.sha256(b"".join([text.encode(), *hashes])).hexdigest()[:16]
+        return hash_task([self.table.model_dump(), self.gear_ratio, version("jaxbl")], self.record, self.holdout)
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,8 @@ def read_element_task(
     if other is not None:
         check_positions(record, other)
         check_positions(other, record)
-    return ElementTask(table, None if len(record.positions) < 2 else gear_ratio or 1.0, record, other)
+    ratio = None if len(record.positions) < 2 else gear_ratio or 1.0
+    return ElementTask(table, ratio, record, None if other is None else SealedRecord(other))
 
 
 def identify_element(
@@ -155,13 +152,13 @@ def _summary(task: ElementTask, element: Element) -> JsonObject:
             {"direction": {_PATHS.get(name, name): 1.0}, "why": "this log leaves it open by more than half of its value"}
             for name in element.open
         ],
-        "method": {"element": {"terms": element.terms, "gains": element.gains, "reversals": element.reversals}},
+        "method": {"element": {"terms": element.model.terms, "gains": element.gains, "reversals": element.reversals}},
         "torque": {"element": {"rms": element.residual, "relative": element.share, "unit": element.numbers["offset"].unit}},
         "warnings": record.warnings,
         "notes": [*record.notes, *([_SLIP_NOTE] if "slip" in numbers else [])],
     }
     if task.holdout is not None:
-        error = element_error(element, make_rig_log(task.holdout, task.gear_ratio))
+        error = element_error(element, make_rig_log(task.holdout.open(), task.gear_ratio))
         rms, relative = error or (None, None)
         summary["holdout"] = {"file": str(task.holdout.path.resolve()), "torque": {"rms": rms, "relative": relative}}
     return summary

@@ -60,6 +60,12 @@ def _hash_of(record: Record) -> bytes:
     return total.digest()
 
 
+def hash_task(settings: Sequence[Any], record: Record, holdout: SealedRecord | None) -> str:
+    """Hash of settings, as JSON, and of the logs that decide a result."""
+    hashes = [_hash_of(record), b"" if holdout is None else holdout.hash]
+    return hashlib.sha256(b"".join([json.dumps(settings, sort_keys=True).encode(), *hashes])).hexdigest()[:16]
+
+
 @dataclass(frozen=True)
 class LogTask:
     """A study and its log, and what is asked of them: everything that decides the result.
@@ -95,10 +101,8 @@ class LogTask:
     @property
     def identity(self) -> str:
         """Hash of everything that decides the result."""
-        text = json.dumps([self.config.to_dict(), sorted(self.missing), version("jaxbl"), _SUMMARIES], sort_keys=True)
-        total = hashlib.sha256(text.encode() + _hash_of(self.record))
-        total.update(b"" if self.holdout is None else self.holdout.hash)
-        return total.hexdigest()[:16]
+        settings = [self.config.to_dict(), sorted(self.missing), version("jaxbl"), _SUMMARIES]
+        return hash_task(settings, self.record, self.holdout)
 
 
 _SUMMARIES = 7

@@ -82,24 +82,21 @@ class Element:
             torque of a transmission that slips beyond it).
         open: names of the numbers that the log leaves uncertain by more than half.
         gains: term of the model -> squared error without it over that with it, less 1, on blocks that were left out.
-        terms: of the model.
         torque: of the model at each sample of the log, shape (samples,); NaN around reversals.
         residual: rms of measured minus modelled torque, N m (N).
         share: the same over the rms of the torque about its mean.
         reversals: number of reversals of the displacement.
-        shapes, sizes: nonlinear and linear numbers as the model uses them.
+        model: with the numbers as it uses them.
     """
 
     numbers: dict[str, Quantity]
     open: tuple[str, ...]
     gains: dict[str, float]
-    terms: tuple[str, ...]
     torque: np.ndarray
     residual: float
     share: float
     reversals: int
-    shapes: np.ndarray
-    sizes: np.ndarray
+    model: "Model"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `inspection.json`."""
@@ -160,11 +157,11 @@ class _Rig:
     def fitted_torque(self) -> np.ndarray:
         return self.torque[self.rows]
 
-    def compute_torque(self, model: "_Model | Element") -> np.ndarray:
+    def compute_torque(self, model: "Model") -> np.ndarray:
         """Return the torque of a model, N m (N), shape (rows,)."""
         return self.compute_columns(model.terms, model.shapes) @ model.sizes
 
-    def compute_error(self, model: "_Model | Element") -> tuple[float, float]:
+    def compute_error(self, model: "Model") -> tuple[float, float]:
         """Return the rms torque error of a model, N m (N), and the same over the rms of the torque about its mean."""
         error = rms(self.fitted_torque - self.compute_torque(model))
         return error, error / float(np.std(self.fitted_torque))
@@ -303,7 +300,7 @@ def _find_reversals(values: np.ndarray, least: float) -> list[int]:
     return reversals
 
 
-class _Model(NamedTuple):
+class Model(NamedTuple):
     """A model on a log: its terms, shapes, and linear numbers."""
 
     terms: tuple[str, ...]
@@ -316,7 +313,7 @@ class _Model(NamedTuple):
         return bool((np.delete(self.sizes, 1) > 0.0).all())
 
 
-def _add_terms(rig: _Rig, best: _Model) -> _Model:
+def _add_terms(rig: _Rig, best: Model) -> Model:
     """Add terms, as long as one of them lowers the error clearly."""
     while True:
         models = [
@@ -338,7 +335,7 @@ def _add_terms(rig: _Rig, best: _Model) -> _Model:
                 best = model
 
 
-def _drop_terms(rig: _Rig, model: _Model) -> _Model:
+def _drop_terms(rig: _Rig, model: Model) -> Model:
     """Drop terms that do not lower the error clearly, those with the smallest gain first."""
     while True:
         sufficient_models = [
@@ -351,11 +348,11 @@ def _drop_terms(rig: _Rig, model: _Model) -> _Model:
         model = min(sufficient_models, key=lambda reduced: np.mean(_held_out_errors(rig, reduced)))
 
 
-def _fit_without(rig: _Rig, model: _Model, term: str) -> _Model:
+def _fit_without(rig: _Rig, model: Model, term: str) -> Model:
     return _drop_negative_terms(rig, _fit_model(rig, tuple(name for name in model.terms if name != term), model))
 
 
-def _drop_negative_terms(rig: _Rig, model: _Model, new_term: str = "") -> _Model:
+def _drop_negative_terms(rig: _Rig, model: Model, new_term: str = "") -> Model:
     """Drop terms with a negative size; if `new_term` is among them, return the model unchanged."""
     while True:
         sizes = dict(zip((term for term in model.terms if term in SIZE_NAMES), model.sizes[2:], strict=True))
@@ -371,7 +368,7 @@ def _shape_names(terms: Sequence[str]) -> list[str]:
     return [name for name in names if name != "centre" or "slip" not in terms]
 
 
-def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) -> _Model:
+def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> Model:
     """Fit a model by least squares. The search starts at the shapes of `near`; other shapes start at the best of a grid."""
     from scipy.optimize import least_squares
 
@@ -398,17 +395,17 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: _Model | None = None) ->
         shapes = search(best.x, args=(rig,)).x
     columns = rig.compute_columns(terms, shapes)
     scale = column_rms(columns) + 1e-300
-    return _Model(terms, shapes, np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale)
+    return Model(terms, shapes, np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale)
 
 
-def _held_out_errors(rig: _Rig, model: _Model) -> np.ndarray:
+def _held_out_errors(rig: _Rig, model: Model) -> np.ndarray:
     """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
     columns, torque = rig.compute_columns(model.terms, model.shapes), rig.fitted_torque
     # rounding, for a log without noise
     return BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * np.mean(torque**2)
 
 
-def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
+def _compute_gain(rig: _Rig, without: Model, model: Model) -> float | None:
     """Compute the squared error without a term over that with it, less 1, on left-out blocks; None if not clearly above 0.
 
     Logarithms are compared: a term may matter a hundred times as much in one block as in another.
@@ -418,7 +415,7 @@ def _compute_gain(rig: _Rig, without: _Model, model: _Model) -> float | None:
     return math.expm1(mean) if mean > _SURE_ERRORS * mean_error(gains) else None
 
 
-def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, float], linear: bool) -> Element:
+def _make_element(rig: _Rig, full_rig: _Rig, model: Model, gains: dict[str, float], linear: bool) -> Element:
     """Compute the numbers, with errors by a jackknife over blocks: these hold for errors of any correlation in time."""
     names = [
         "stiffness",
@@ -458,9 +455,7 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: _Model, gains: dict[str, flo
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_torque(model)
     reversals = sum(not begins for _, begins in rig.stretches)
-    return Element(
-        numbers, tuple(open_), gains, model.terms, torque, *rig.compute_error(model), reversals, model.shapes, model.sizes
-    )
+    return Element(numbers, tuple(open_), gains, torque, *rig.compute_error(model), reversals, model)
 
 
 _UNITS = {
@@ -476,4 +471,4 @@ def element_error(element: Element, log: RigLog) -> tuple[float, float] | None:
     None if the log cannot be fitted.
     """
     rig = _prepare_rig(log)
-    return None if rig is None else rig.compute_error(element)
+    return None if rig is None else rig.compute_error(element.model)

@@ -344,7 +344,9 @@ def _find_loose_gap(record: Record, ratio: float) -> float:
     velocity, acceleration = np.concatenate(motion, axis=1)
     through = torque - fit.values[:3] @ np.stack([acceleration, velocity, smooth_sign(velocity)])
     gear = fit_element(make_rig_log(record, ratio)._replace(torque=through), linear=False)
-    return 0.0 if gear is None or "half_gap" in gear.open or "gap" not in gear.terms else gear.numbers["half_gap"].value
+    return (
+        0.0 if gear is None or "half_gap" in gear.open or "gap" not in gear.model.terms else gear.numbers["half_gap"].value
+    )
 
 
 def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> tuple[_Answer, str]:

@@ -28,7 +28,7 @@ def simulate_rig(count=2400, seed=1, gap=GAP):
 def test_a_gap_hysteresis_and_friction_are_told_apart():
     x, u = simulate_rig()
     fit = fit_element(RigLog(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, 1e-5), linear=False)
-    assert set(fit.terms) == {"gap", "dry friction", "hysteresis"}
+    assert set(fit.model.terms) == {"gap", "dry friction", "hysteresis"}
     truth = {
         "stiffness": STIFFNESS, "half_gap": GAP, "centre": CENTRE, "dry_friction": FRICTION, "hysteresis": TORQUE,
         "length": LENGTH, "offset": 0.3,
@@ -49,7 +49,7 @@ def test_play_spring_and_slip_in_series(repeats):
     for _ in range(repeats(3, 30)):
         x, force, truth = simulate_band(random)
         fit = fit_element(RigLog(x, force, [slice(0, len(x))], PERIOD, 0.0), linear=True)
-        assert set(fit.terms) == {"gap", "slip"} and not fit.open
+        assert set(fit.model.terms) == {"gap", "slip"} and not fit.open
         for name, value in truth.items():
             number = fit.numbers[name]
             assert abs(number.value / value - 1.0) < 0.05, (name, number, value)
@@ -62,7 +62,7 @@ def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(2000))
     u = 3.0e4 * x + random.standard_normal(2000)
     fit = fit_element(RigLog(x, u, [slice(0, 2000)], PERIOD, 0.0), linear=True)
-    assert fit.terms == () and fit.numbers["stiffness"].unit == "N/m"
+    assert fit.model.terms == () and fit.numbers["stiffness"].unit == "N/m"
     low, high = fit.numbers["stiffness"].interval
     assert low < 3.0e4 < high < 1.01 * 3.0e4
     one_way = RigLog(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, 0.0)
