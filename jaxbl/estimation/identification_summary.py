@@ -141,8 +141,7 @@ def by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
 
 def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profiles: Mapping[str, Profile]) -> JsonObject:
     """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
-    noise = {side: float(deviation) for side, deviation in search_fit.windows.noise.items()}
-    record, width = task.record, search_fit.spread.covariance
+    record, noise, width = task.record, search_fit.windows.noise, search_fit.spread.covariance
     deviation = np.sqrt(np.diag(width))
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
@@ -181,8 +180,9 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
 
 
 def mark_lacking(summary: JsonObject, lacking: MotionShare | None) -> None:
-    """Mark a fit that left a torque that goes with the motion: no interval counts what a missing effect does to numbers."""
-    if summary["rejected"] is None or lacking is None:
+    """Mark a rejected fit, if it left a torque that goes with the motion: no interval counts what a missing effect does to
+    numbers."""
+    if lacking is None:
         return
     summary["rejected"] = {"lacks": lacking._asdict()}
     for parameter in summary["parameters"].values():

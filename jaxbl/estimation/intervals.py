@@ -134,8 +134,7 @@ def long_run(scores: np.ndarray, least: int = 1) -> np.ndarray:
 def interval(parameter: FreeParameter, theta: float, deviation: float) -> tuple[float, float]:
     """95 % interval of a value, from its theta; never below zero where the value must be positive."""
     reach = NORMAL * deviation
-    low, high = (float(parameter.value(theta + side * reach)) for side in (-1.0, 1.0))
-    return min(low, high), max(low, high)
+    return float(parameter.value(theta - reach)), float(parameter.value(theta + reach))
 
 
 class Refusal(NamedTuple):
@@ -215,7 +214,7 @@ def profile(
 
 def _gather_profile(parameter: FreeParameter, centre: float, below: _Points, above: _Points) -> Profile:
     lower, upper = map(step_at_limit, (below, above))
-    points = sorted([(-step, d) for step, d in below] + [(step, d) for step, d in above[1:]])
+    points = sorted([(-step, d) for step, d in below] + above[1:])
     low, high = (float(parameter.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
     values = np.array([float(parameter.value(centre + step)) for step, _ in points])
     return Profile(

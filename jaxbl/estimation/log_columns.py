@@ -58,7 +58,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)).ravel()
     for i, side in enumerate(fitted.sides):
         column = columns[f"{side}.residual"] = np.full(len(record.time), np.nan)
-        column[rows] = float(search_fit.windows.noise[side]) * search_fit.fit.residual[:, :, i].ravel()
+        column[rows] = search_fit.windows.noise[side] * search_fit.fit.residual[:, :, i].ravel()
     return columns | join_columns(len(record.time), segments, pieces)
 
 

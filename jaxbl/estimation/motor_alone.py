@@ -110,7 +110,7 @@ def alone_of(
     values, reason = model.numbers(point.theta), ""
     if gap is not None and model.gap is not None:
         # what is said of the gap is said of the model that is left
-        gap = gap.of(point, width)
+        gap = gap._replace(best=point, spread=width) if gap.is_needed else gap._replace(without=point)
         reason = why_not(gap, model, spread, record)
         absent = [*absent, model.gap] if reason else absent
         if not gap.is_needed:

@@ -90,8 +90,10 @@ class SearchFit(Fitted):
 
 def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarray:
     """Theta with phases within half a turn of their nominal values."""
-    turns = np.array([2.0 * np.pi / parameter.scale if parameter.role == "angle" else 0.0 for parameter in free])
-    return theta - turns * np.round(theta / np.where(turns > 0.0, turns, 1.0))
+    turns = np.array(
+        [np.round(x / (2.0 * np.pi)) if parameter.role == "angle" else 0.0 for parameter, x in zip(free, theta, strict=True)]
+    )
+    return theta - 2.0 * np.pi * turns
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class Windows(eqx.Module):
     measured: dict[str, Float[np.ndarray, "windows samples"]]
     time: Float[np.ndarray, " windows"]
     start: PlantState
-    noise: dict[str, Float[np.ndarray, ""]]
+    noise: dict[str, float]
     at_rest: Bool[np.ndarray, " windows"]
     finer: Residuals
     gain: dict[str, Float[np.ndarray, " 2"]] | None = None
@@ -119,7 +119,7 @@ def simulate_windows(experiment: Experiment, windows: Windows, start: PlantState
 
 def positions_over_noise(experiment: Experiment, windows: Windows, positions: Mapping[str, Any]) -> np.ndarray:
     """Positions of the sides over the noise, shape (windows, samples, sides)."""
-    return np.stack([positions[side] / float(windows.noise[side]) for side in experiment.sides], axis=-1)
+    return np.stack([positions[side] / windows.noise[side] for side in experiment.sides], axis=-1)
 
 
 def _leave(experiment: Experiment, windows: Windows, states: PlantState) -> np.ndarray:
@@ -159,7 +159,7 @@ def _differentiate(
         slopes[i] = reached[:, rows]
         reached = by_state[i] @ reached
         reached[:, :, : len(free)] += steps[i, :, :, : len(free)]
-    noise = np.array([float(windows.noise[side]) for side in experiment.sides])
+    noise = np.array([windows.noise[side] for side in experiment.sides])
     return -slopes.transpose(1, 0, 2, 3) / noise[:, None]
 
 
@@ -393,7 +393,7 @@ def cut(
         measured={side: split(values) for side, values in measured.items()},
         time=first + period * samples * np.arange(count),
         start=PlantState(start.position, still, start.effects),
-        noise={side: np.asarray(value, float) for side, value in noise.items()},
+        noise=noise,
         at_rest=standing,
         finer=np.zeros((count, samples, len(measured))),
     )

@@ -410,10 +410,6 @@ class Gap(NamedTuple):
         """True if the readings cannot be met without a gap."""
         return self.gain >= SHOWN
 
-    def of(self, point: Point, spread: Spread) -> "Gap":
-        """The same of another fit, with the gap or, where it is not needed, without; as of :meth:`UnseenLoad.settle`."""
-        return self._replace(best=point, spread=spread) if self.is_needed else self._replace(without=point)
-
 
 def _likeliest(points: Sequence[Point]) -> Point:
     """The point with the least deviance."""
