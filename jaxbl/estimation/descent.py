@@ -64,6 +64,6 @@ def linearise(
         precision: of their prior, shape (numbers,).
         variance: of a residual.
     """
-    slope = slope.reshape(-1, len(numbers))
+    slope = slope.reshape(residual.size, len(numbers))
     towards = slope.T @ residual.ravel() / variance + precision * numbers
     return slope.T @ slope / variance + np.diag(precision), towards

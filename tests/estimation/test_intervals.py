@@ -53,6 +53,15 @@ def test_where_the_fit_is_quadratic_both_intervals_agree():
         assert profiles[number.path].deviance.min() == 0.0
 
 
+def test_the_profile_of_a_number_alone_is_that_of_its_own_fit():
+    windows = simulate_mass(size=2.0)
+    experiment, free, result = fit_numbers(["drive.motor_inertia"], windows)
+    width = spread(result)
+    low, high = interval(free[0], float(result.theta[0]), float(np.sqrt(width.covariance[0, 0])))
+    (ends,) = (numbers.interval for numbers in profile(experiment, free, windows, result, width).values())
+    np.testing.assert_allclose(ends, (low, high), atol=0.05 * (high - low), rtol=0.0)
+
+
 def test_where_it_is_not_the_profile_follows_the_likelihood():
     """Weak excitation: the friction is hardly seen. The reference is a root of the cost with all else fitted anew."""
     windows = simulate_mass(size=0.003, seed=3)
