@@ -258,8 +258,8 @@ def trace_of(
                 piece[f"{side}.noise"] = residuals["missing_before"].deviation
                 late = observed[part][side][i]
                 for name, values in (("before", late.residual.torque), ("noise", late.residual.deviation)):
-                    told = values if late.has_converged else np.full_like(values, np.nan)
-                    piece[f"{side}.observed_{name}"] = np.append(np.full(late.skipped, np.nan), told)
+                    estimate = values if late.has_converged else np.full_like(values, np.nan)
+                    piece[f"{side}.observed_{name}"] = np.append(np.full(late.skipped, np.nan), estimate)
             segments.append(segment)
             pieces.append(piece)
     return pd.DataFrame(columns | join_columns(len(joined.time), segments, pieces))

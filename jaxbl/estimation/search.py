@@ -149,8 +149,8 @@ class ParameterSearch:
             worst = max(left, key=lambda refusal: refusal.deviation)
             out = max(worst.direction, key=lambda path: abs(worst.direction[path]))
             held.append(out)
-            kept = np.array([parameter.path != out for parameter in free])
-            free, theta = tuple(itertools.compress(free, kept)), theta[kept]
+            is_free = np.array([parameter.path != out for parameter in free])
+            free, theta = tuple(itertools.compress(free, is_free)), theta[is_free]
             best = self._whole(free, theta)
             left, _ = refusals(best.free, best.spread)
         return SearchFit(**vars(best), refused=refused, held=held, condition=condition, starts=starts)
