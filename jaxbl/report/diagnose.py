@@ -228,7 +228,7 @@ def _names(summary: JsonObject) -> str:
 
 def _join_words(words: Sequence[str]) -> str:
     """Join words as in a sentence: a, b and c."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    return ", ".join([*words[:-2], " and ".join(words[-2:])])
 
 
 def _failed_checks(summary: JsonObject) -> Lines:
