@@ -297,9 +297,11 @@ def test_what_is_held_out_is_read_once_when_the_model_stands(logs, monkeypatch):
     other = dataclasses.replace(task, holdout=SealedRecord(dataclasses.replace(record, torque=torque)))
     second = run_diagnosis(other)
     assert second.model == first.model and second.summary["history"] == first.summary["history"]
-    assert [finding["confidence"] for finding in second.summary["findings"]] == [
-        finding["confidence"] for finding in first.summary["findings"]
-    ]
+    (before,), (after,) = first.summary["findings"], second.summary["findings"]
+    assert before["effect"] == after["effect"] and before["z"] == after["z"]
+    # a name is no surer than what is held out makes it
+    assert before["holdout_z"] > 5.0 and before["confidence"] > 0.99
+    assert after["holdout_z"] < before["holdout_z"] and after["confidence"] <= before["confidence"]
     assert first.summary["verdict"] == "explained" and second.summary["verdict"] == "unknown_effect"
 
 
@@ -378,7 +380,9 @@ def test_what_is_tied_is_parted_by_the_experiment_that_is_asked_for(tmp_path):
     assert best is not None and best.apart > 100.0
     simulate_direct_drive(best.torque, [friction], 1e-3, 3).write(other)
     (finding,) = diagnose([log, other], nominal_study(), holdout=holdout).summary["findings"]
-    assert finding["effect"] == "motor.coulomb_friction" and finding["confidence"] > 0.99
+    # what is held out is fast, and shows it by some three standard errors
+    assert finding["effect"] == "motor.coulomb_friction" and finding["confidence"] > 0.9
+    assert not finding["alternatives"]
     assert finding["parameters"]["torque"]["value"] == pytest.approx(0.004, rel=0.05)
 
 
