@@ -98,6 +98,7 @@ def gains_for(
         # several do exactly the same where noise is fine: the first of them, whatever rounding says
         best = int(np.argmax(size <= (1.0 + 1e-9) * np.min(size)))
         chosen = {path: float(column[best]) for path, column in candidates.items() if path.startswith(f"observer.{side}.")}
-        gains[side] = ChosenGains(*chosen.values(), f_plus[side], float(size[best]))
+        lambda_, alpha_ = chosen.values()
+        gains[side] = ChosenGains(lambda_, alpha_, f_plus[side], float(size[best]))
         values |= chosen
     return gains, values

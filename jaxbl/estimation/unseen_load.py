@@ -137,7 +137,7 @@ class UnseenLoad:
         self.period = float(self.experiment.run.sample_period)
         self.skipped = [int(_SKIPPED * len(segment)) for segment in self.segments]
         # segment of each error
-        self.owner = np.repeat(np.arange(len(self.segments)), np.array([*map(len, self.segments)]) - self.skipped)
+        self.owner = np.repeat(np.arange(len(self.segments)), np.subtract([*map(len, self.segments)], self.skipped))
         self.count = len(self.owner)
         self.precision = np.concatenate([self.width**-2.0, np.ones(_STATES * len(self.segments))])
         self._speed = rms(np.concatenate([segment.smoothed["motor"].velocity for segment in self.segments]))

@@ -93,7 +93,7 @@ def test_a_lag_of_the_actuator_is_followed():
 def test_decimation_keeps_what_is_slow(factor):
     slow, fast = np.sin(2.0 * np.pi * 2.0 * T), 0.3 * np.sin(2.0 * np.pi * 900.0 * T)
     decimated = decimate(jnp.asarray(slow + fast), factor)
-    edge = 10 * factor
+    edge = 0 if factor == 1 else 10 * factor
     expected = (slow + (fast if factor == 1 else 0.0))[edge : len(T) - edge : factor]
     np.testing.assert_allclose(decimated, expected, atol=2e-3)
     reference = signal.decimate(np.asarray(slow), factor, ftype="fir") if factor > 1 else slow
