@@ -1,4 +1,5 @@
-"""How sure a finding is: against other effects in its place, against its size, and by blocks of the log."""
+"""How sure a finding is: against other effects in its place, against its size, by blocks of the log, and by
+what is held out."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -77,7 +78,7 @@ def confirm(findings: Sequence[Finding], holdout_z: Mapping[str, float]) -> tupl
 def _confirm(finding: Finding, z: float) -> Finding:
     chance = finding.confidence + sum(chance for _, chance in finding.alternatives)
     # nats of a normal number of mean z over one of mean 0
-    part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / chance)
+    part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / max(chance, 1e-300))
     alternatives = tuple((name, part * chance) for name, chance in finding.alternatives)
     return finding._replace(confidence=part * finding.confidence, alternatives=alternatives)
 
