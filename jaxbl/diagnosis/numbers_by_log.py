@@ -16,6 +16,7 @@ import numpy as np
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.estimation.logs import arrays
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 from jaxbl.records.least_squares import BlockRegression, column_rms, rms
 
 from .diagnosis_task import DiagnosisTask
@@ -62,11 +63,8 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
             continue
         value, slope = (float(of(fitted.theta[k])) for of in (number.value, number.slope))
         logs = [
-            {
-                "log": names[i],
-                "value": value + slope * float(by_log[i].change[k]),
-                "standard_error": abs(slope) * float(by_log[i].error[k]),
-            }
+            {"log": names[i]}
+            | Quantity(value + slope * float(by_log[i].change[k]), abs(slope) * float(by_log[i].error[k])).to_dict()
             for i in pair
         ]
         unit = task.record.unit_of(number.path, number.unit)
