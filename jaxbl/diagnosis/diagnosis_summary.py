@@ -256,10 +256,10 @@ def trace_of(
                 residuals = {name: torques[part][side][i] for name, torques in missing.items()}
                 piece |= {f"{side}.{name}": residual.torque for name, residual in residuals.items()}
                 piece[f"{side}.noise"] = residuals["missing_before"].deviation
-                late = observed[part][side][i]
-                for name, values in (("before", late.residual.torque), ("noise", late.residual.deviation)):
-                    estimate = values if late.has_converged else np.full_like(values, np.nan)
-                    piece[f"{side}.observed_{name}"] = np.append(np.full(late.skipped, np.nan), estimate)
+                by_observer = observed[part][side][i]
+                for name, values in (("before", by_observer.residual.torque), ("noise", by_observer.residual.deviation)):
+                    estimate = values if by_observer.has_converged else np.full_like(values, np.nan)
+                    piece[f"{side}.observed_{name}"] = np.append(np.full(by_observer.skipped, np.nan), estimate)
             segments.append(segment)
             pieces.append(piece)
     return pd.DataFrame(columns | join_columns(len(joined.time), segments, pieces))

@@ -537,10 +537,10 @@ class Linear:
 
 
 def _peaks(
-    waves: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, distance: float
+    waves: np.ndarray, score: np.ndarray, few: np.ndarray, power: np.ndarray, inside: np.ndarray, distance: int
 ) -> list[float]:
-    """Waves at which a score, over the power that noise gives it (known at a `few`), has its highest peaks; `distance`
-    between two of them, in waves. Neither the first nor the last wave is `inside`."""
+    """Waves at which a score, over the power that noise gives it (known at a `few`), has its highest peaks, so many
+    waves of the list apart. Neither the first nor the last wave is `inside`."""
     expected = np.exp(np.interp(np.log(np.maximum(waves, 1e-9)), np.log(few), np.log(np.maximum(power, 1e-300))))
     score = np.where(inside, score / expected, 0.0)
     peaks, _ = find_peaks(score, distance=distance)

@@ -105,7 +105,7 @@ class LogTask:
         return hash_task(settings, self.record, self.holdout)
 
 
-_SUMMARIES = 7
+_SUMMARIES = 8
 """Version of what `identification.json` and `diagnosis.json` hold: results of another one are computed anew."""
 _MOST_STEPS = 1000
 """Plant steps between two samples of a log at most: a drive moves through many of its time constants then."""

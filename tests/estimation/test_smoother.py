@@ -61,9 +61,24 @@ def test_agrees_with_least_squares_over_all_states():
     np.testing.assert_allclose(result.covariance[60] / outer, covariance[60] / outer, atol=1e-4)
 
 
+def predict_one_ahead(readings, noise, jerk):
+    """Prediction errors of a Kalman filter over their standard deviations."""
+    state, covariance, errors = np.array([readings[0], 0.0, 0.0]), np.diag([noise**2, 1.0, 1e3]), []
+    for reading in readings[1:]:
+        state, covariance = F @ state, F @ covariance @ F.T + jerk / JERK * Q
+        error, variance = reading - state[0], covariance[0, 0] + noise**2
+        gain = covariance[:, 0] / variance
+        state, covariance = state + gain * error, covariance - np.outer(gain, covariance[0])
+        errors.append(error / np.sqrt(variance))
+    return np.array(errors)
+
+
 def test_finds_noise_and_jerk_and_knows_its_errors():
     state, readings = simulate_motion(2, 6000)
     result = smooth(readings, PERIOD)
+    white = predict_one_ahead(readings, float(result.noise), float(result.jerk))[100:]
+    assert abs(np.mean(white[1:] * white[:-1])) < 0.05
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.06)
     assert float(result.noise) == pytest.approx(NOISE, rel=0.05)
     assert float(result.jerk) == pytest.approx(JERK, rel=0.5)
     for order in range(3):
