@@ -911,6 +911,7 @@ DIAGNOSIS = {
         {
             "effect": "motor.coulomb_friction",
             "confidence": 0.97,
+            "likely": True,
             "share": 0.12,
             "z": 21.0,
             "parameters": {"torque": {"value": 0.05, "standard_error": 0.001, "unit": "N m"}},
@@ -918,7 +919,6 @@ DIAGNOSIS = {
         }
     ],
     "where": {"motor": {"sentence": "motor side, somewhere"}},
-    "rest": {},
     "contradictions": [],
     "warnings": [],
     "notes": [],

@@ -37,10 +37,14 @@ class Finding(NamedTuple):
     alternatives: tuple[tuple[str, float], ...]
 
     @property
+    def chance(self) -> float:
+        """Probability that it is this one, or another effect that is listed in its place."""
+        return self.confidence + sum(chance for _, chance in self.alternatives)
+
+    @property
     def is_likely(self) -> bool:
-        """True if it, or another effect that is listed in its place, is likelier than not."""
-        chance = self.confidence + sum(chance for _, chance in self.alternatives)
-        return chance > 1.0 - chance
+        """True if one of these is likelier than none."""
+        return self.chance > 1.0 - self.chance
 
 
 def weigh(explanation: Explanation, left: float = 0.0) -> tuple[Finding, ...]:
@@ -76,9 +80,8 @@ def confirm(findings: Sequence[Finding], holdout_z: Mapping[str, float]) -> tupl
 
 
 def _confirm(finding: Finding, z: float) -> Finding:
-    chance = finding.confidence + sum(chance for _, chance in finding.alternatives)
     # nats of a normal number of mean z over one of mean 0
-    part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / max(chance, 1e-300))
+    part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / max(finding.chance, 1e-300))
     alternatives = tuple((name, part * chance) for name, chance in finding.alternatives)
     return finding._replace(confidence=part * finding.confidence, alternatives=alternatives)
 

@@ -115,6 +115,7 @@ def describe_finding(record: Record, finding: Finding, errors: Numbers, where: J
     return {
         "effect": finding.effect,
         "confidence": finding.confidence,
+        "likely": finding.is_likely,
         "parameters": numbers,
         "alternatives": [{"effect": name, "confidence": chance} for name, chance in finding.alternatives],
         "where": {"place": place, "sentences": {side: where[side]["sentence"] for side in sides}},
@@ -157,10 +158,8 @@ def _reach(log: ReferenceLog) -> Errors:
     """Measure how far a log reaches: travel and largest speed of each side, and largest torque of the input."""
     reach = {name: np.ptp(values) for name, values in log.readings().items()}
     for side in log.noise:
-        speeds = np.concatenate([segment.smoothed[side].velocity for segment in log.segments])
-        reach[f"velocity_{side}"] = float(np.max(np.abs(speeds)))
-    torques = np.concatenate([segment.torque for segment in log.segments])
-    return reach | {"torque_motor": float(np.max(np.abs(torques)))}
+        reach[f"velocity_{side}"] = max(np.max(np.abs(segment.smoothed[side].velocity)) for segment in log.segments)
+    return reach | {"torque_motor": max(np.max(np.abs(segment.torque)) for segment in log.segments)}
 
 
 _UNITS = {"theta": "rad", "velocity": "rad/s", "torque": "N m"}

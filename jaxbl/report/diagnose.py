@@ -64,7 +64,7 @@ _FAR = 10.0
 
 
 def _key_figures(summary: JsonObject) -> list[KeyFigure]:
-    """Errors of torque and position on held-out data, and the least certain effect with its first number."""
+    """Errors of torque and position on held-out data, and the least certain of the likely effects."""
     gap, figures = summary["gap"], []
     errors = _errors_of_channels(gap)
     for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
@@ -74,7 +74,7 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
             change = f"{rms_text(before)} → {rms_text(after)} {gap['units'][name]}"
             figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (limit {rms_text(limit)})"))
     if summary["findings"]:
-        finding = min(summary["findings"], key=lambda finding: finding["confidence"])
+        finding = min(summary["findings"], key=lambda finding: (not finding["likely"], finding["confidence"]))
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
         figures += [
             KeyFigure(str(number), f"{finding['effect']}: {leaf}"),
@@ -101,7 +101,10 @@ def _reasons(summary: JsonObject) -> Lines:
             )
         texts = ", ".join(f"{leaf} = {number}" for leaf, number in numbers.items())
         z = finding.get("holdout_z")
-        support = "" if z is None else f", shown by held-out data to {z:.1f} standard errors"
+        support = ""
+        if z is not None:
+            way = "better" if z > 0.0 else "worse"
+            support = f"; held-out data are predicted {way} with it, by {abs(z):.1f} standard errors"
         lines.append(
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
             f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}{support}."
@@ -219,11 +222,8 @@ def _table_lines(summary: JsonObject) -> Lines:
 
 def _names(summary: JsonObject) -> str:
     """Names of the effects that were found, as in a sentence; what may as well be something unknown is there perhaps."""
-    names = []
-    for finding in summary["findings"]:
-        confidence = finding["confidence"] + sum(other["confidence"] for other in finding["alternatives"])
-        names.append(finding["effect"] if confidence > 0.5 else f"perhaps {finding['effect']}")
-    return _join_words(sorted(names, key=lambda name: name.startswith("perhaps ")))
+    findings = sorted(summary["findings"], key=lambda finding: not finding["likely"])
+    return _join_words([finding["effect"] if finding["likely"] else f"perhaps {finding['effect']}" for finding in findings])
 
 
 def _join_words(words: Sequence[str]) -> str:
@@ -323,8 +323,10 @@ def draw(diagnosis: Diagnosis) -> list[Figure]:
     if not diagnosis.located:
         return [draw_motor_alone(diagnosis)]
     unit = diagnosis.record.unit_of("motor.torque", "N m")
-    residuals = diagnosis.residuals.items()
-    over = [draw_residual(parts, diagnosis.coordinates[side], diagnosis.located[side], unit) for side, parts in residuals]
+    over = [
+        draw_residual(parts, diagnosis.coordinates[side], diagnosis.located[side], unit)
+        for side, parts in diagnosis.residuals.items()
+    ]
     return [_over_time(diagnosis), *over]
 
 

@@ -12,6 +12,7 @@ from passed import PASSED
 from jaxbl.diagnosis.residuals import Residual
 from jaxbl.report.diagnose import _over_time, describe as describe_diagnosis
 from jaxbl.report.drawing import save
+from jaxbl.result import KeyFigure
 
 ERRORS = {
     "theta_e": 0.1,
@@ -37,6 +38,7 @@ SUMMARY = {
         {
             "effect": "load.coulomb_friction",
             "confidence": 0.93,
+            "likely": True,
             "share": 0.12,
             "z": 21.0,
             "parameters": {"torque": {"value": 0.274, "standard_error": 0.0021, "unit": "N m"}},
@@ -44,7 +46,6 @@ SUMMARY = {
         }
     ],
     "where": {"motor": {"sentence": "motor side: nothing beyond noise"}, "load": {"sentence": "load side, here"}},
-    "rest": {"load.drift": {"evidence": -3.0, "share": 0.001}, "load.time": {"evidence": None, "share": 0.0}},
     "explained_share": 0.83,
     "contradictions": [],
     "parameters": {"drive.motor_inertia": {"value": 0.01, "nominal": 0.02, "standard_error": 1e-4, "unit": "kg m²"}},
@@ -137,14 +138,20 @@ def test_numbers_that_are_further_off_come_first():
 
 def test_an_effect_that_may_as_well_be_something_unknown_is_there_perhaps():
     (sure,) = SUMMARY["findings"]
-    unsure = sure | {"effect": "motor.cogging", "confidence": 0.0, "alternatives": []}
+    unsure = sure | {"effect": "motor.cogging", "confidence": 0.01, "likely": False, "holdout_z": -2.24, "alternatives": []}
     tied = sure | {
         "effect": "load.gravity",
         "confidence": 0.5,
         "alternatives": [{"effect": "motor.cogging", "confidence": 0.5}],
     }
-    headline = describe_diagnosis(change_summary(findings=[unsure, sure, tied])).headline
-    assert headline.startswith("The model lacks load.coulomb_friction, load.gravity and perhaps motor.cogging; with them,")
+    result = describe_diagnosis(change_summary(findings=[unsure, sure | {"holdout_z": 9.42}, tied]))
+    names = "The model lacks load.coulomb_friction, load.gravity and perhaps motor.cogging; with them,"
+    assert result.headline.startswith(names)
+    # the least certain of those that are likely stands at the head
+    assert result.key_figures[-1] == KeyFigure("0.50", "confidence that it is load.gravity")
+    said = {line.split(" ")[0]: line.partition("; held-out data ")[2] for line in result.remarks}
+    assert said["load.coulomb_friction"] == "are predicted better with it, by 9.4 standard errors."
+    assert said["motor.cogging"] == "are predicted worse with it, by 2.2 standard errors." and not said["load.gravity"]
 
 
 def test_a_part_that_is_explained_is_said_with_its_share_and_the_reason():
