@@ -27,6 +27,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 from filtered_derivatives import differentiate  # noqa: E402
+from inverse_dynamics import regress  # noqa: E402
 from scipy.linalg import expm  # noqa: E402
 from scipy.optimize import brentq  # noqa: E402
 
@@ -38,7 +39,7 @@ from jaxbl.estimation.free_parameters import make_free_parameters  # noqa: E402
 from jaxbl.estimation.intervals import spread  # noqa: E402
 from jaxbl.estimation.logs import arrays, on_record  # noqa: E402
 from jaxbl.estimation.observer_gains import gains_for  # noqa: E402
-from jaxbl.estimation.regression import errors, regress  # noqa: E402
+from jaxbl.estimation.regression import errors  # noqa: E402
 from jaxbl.estimation.search import ParameterSearch  # noqa: E402
 from jaxbl.estimation.segments import segments_of  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
@@ -386,7 +387,6 @@ def stages():
             (ParameterSearch, "_whole", "fits"),
             (identify_module, "gains_for", "gains"),
             (identify_module, "observer_chain", "chain"),
-            (identify_module, "by_regression", "regression"),
             (identify_module, "torque_errors", "torque errors"),
             (identify_module, "columns_of", "columns of the trace"),
         ]

@@ -118,20 +118,26 @@ class Choice:
         return Chosen(explanation, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
     def _keep_likely(self, explanation: Explanation) -> tuple[Explanation, tuple[Finding, ...]]:
-        """Leave out effects in whose place something unknown is likelier, if blocks do not show them beyond doubt."""
+        """Leave out effects in whose place something unknown is likelier, if blocks do not show them beyond doubt, and what
+        parts them from a plain law, if blocks do not surely show that."""
         while True:
             findings = weigh(explanation, self._find_missing(explanation.fitted)[0] if explanation.fitted.names else 0.0)
+            asked = [finding for finding in findings if finding.effect not in self.search.expected]
             unlikely = [
-                finding
-                for finding in findings
-                if not finding.is_likely
-                and finding.effect not in self.search.expected
-                and explanation.gains[finding.effect].standard_errors < LIMITS.far
+                (finding.confidence, finding.effect, None)
+                for finding in asked
+                if not finding.is_likely and explanation.gains[finding.effect].standard_errors < LIMITS.far
+            ]
+            unlikely += [
+                (finding.confidence, finding.effect, trial)
+                for finding in asked
+                for trial in explanation.plainer[finding.effect]
+                if explanation.odds_of(trial) > 1.0 and trial.gain.standard_errors < LIMITS.sure
             ]
             if not unlikely:
                 return explanation, findings
-            least = min(unlikely, key=lambda finding: finding.confidence)
-            explanation = self.search.leave_out(explanation, least.effect)
+            _, name, plain = min(unlikely, key=lambda finding: finding[0])
+            explanation = self.search.leave_out(explanation, name, plain)
 
     def _find_missing(self, fitted: FittedModel) -> tuple[float, list[str]]:
         """Find the torque that a model leaves of the log where a complete one would leave less, over the driving torque, and

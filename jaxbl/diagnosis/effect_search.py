@@ -127,6 +127,7 @@ class Explanation(NamedTuple):
         fitted: the model with the effects that were found.
         gains: over the model without an effect, by effect.
         rivals: models with another effect in place of one of these, and what the found one gains over each, by effect.
+        plainer: the same with a plain law of it.
         remainder: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size
             among those tried, as a share of the driving torque.
     """
@@ -134,12 +135,17 @@ class Explanation(NamedTuple):
     fitted: FittedModel
     gains: dict[str, Gain]
     rivals: dict[str, list[Trial]]
+    plainer: dict[str, list[Trial]]
     remainder: dict[str, tuple[float, float]]
 
     @property
     def largest_gain(self) -> float:
         """Largest gain of the free functions that are large enough for an effect, nats."""
         return max((gain for gain, share in self.remainder.values() if share > LIMITS.least_torque), default=0.0)
+
+    def odds_of(self, plain: Trial) -> float:
+        """Odds of a plain law in place of an effect: by the gain over it; and what parts them may be something unknown."""
+        return float(np.exp(-plain.gain.worth)) + (self.largest_gain / max(plain.gain.nats, 1.0)) ** 2
 
 
 class EffectSearch:
@@ -248,12 +254,12 @@ class EffectSearch:
             visited.add(state)
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
-            current, gains = self._reduce(better or current, thorough=thorough)
+            current, gains, plainer = self._reduce(better or current, thorough=thorough)
             if better is not None:
                 self.check_model(current)
             if better is not None or self._identify(current) not in visited:
                 continue
-            explanation = self._conclude(current, gains)
+            explanation = self._conclude(current, gains, plainer)
             rivals = explanation.rivals
             accepted = [
                 (name, trial)
@@ -270,17 +276,19 @@ class EffectSearch:
                 self._tried[other] = [Trial((name,), current, best.gain)]
             current = best.fitted
 
-    def _conclude(self, current: FittedModel, gains: dict[str, Gain]) -> Explanation:
+    def _conclude(self, current: FittedModel, gains: dict[str, Gain], plainer: dict[str, list[Trial]]) -> Explanation:
         """Fit rivals to what was found, and free functions to what remains."""
         rivals = {name: self._rivals(current, name) for name in current.names}
-        return Explanation(current, gains, rivals, self.remainder(current))
+        return Explanation(current, gains, rivals, plainer, self.remainder(current))
 
-    def leave_out(self, explanation: Explanation, name: str) -> Explanation:
-        """Explain a log without an effect that was found, and is less likely than something unknown in its place."""
+    def leave_out(self, explanation: Explanation, name: str, plain: Trial | None) -> Explanation:
+        """Explain a log without an effect that was found, or with a plain law of it, as something unknown is likelier in the
+        place of what is left out."""
         current = explanation.fitted
-        less = self._refit(current, _drop_effects(current.numbers, [name]))
-        reason = "something unknown is likelier in its place"
-        self._note(f"leave out {name}", explanation.gains[name], True, reason, loss=True)
+        less = self._refit(current, _drop_effects(current.numbers, [name])) if plain is None else plain.fitted
+        gain = explanation.gains[name] if plain is None else plain.gain
+        change = describe_change(current.numbers, less.numbers)
+        self._note(change, gain, True, "something unknown is likelier in its place", loss=True)
         explanation = self._conclude(*self._reduce(less, thorough=True))
         self._note_remainder(explanation)
         return explanation
@@ -297,7 +305,6 @@ class EffectSearch:
                 trial = self._try(current, ranked[0] if ranked else neutral)
                 stays, reason = self._is_possible(trial.fitted), "known to act"
             else:
-                self.lacking.remove(name)
                 trial = self._try(current, neutral)
                 stays = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
                 reason = f"{trial.gain.rule}, and {LIMITS.effect_size:g} of the driving torque"
@@ -383,17 +390,20 @@ class EffectSearch:
         """Fit a model with other effects, from the own numbers of one; `added`: those that are new there."""
         return self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, added)
 
-    def _reduce(self, current: FittedModel, *, thorough: bool) -> tuple[FittedModel, dict[str, Gain]]:
+    def _reduce(
+        self, current: FittedModel, *, thorough: bool
+    ) -> tuple[FittedModel, dict[str, Gain], dict[str, list[Trial]]]:
         """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
 
         Returns:
-            The model, and what each effect gains; unless `thorough`, only special cases are tried.
+            The model, what each effect gains, and the special cases of each; unless `thorough`, only these are tried.
         """
         while True:
-            gains: dict[str, Gain] = {}
+            gains, plainer = dict[str, Gain](), dict[str, list[Trial]]()
             for name in current.names:
                 certain = name in self.expected
-                fewer = None if certain else self._simplify(current, name)
+                plainer[name] = [] if certain else self._try_plainer(current, name)
+                fewer = next((trial.fitted for trial in plainer[name] if not trial.gain.is_accepted), None)
                 if fewer is None and thorough:
                     less = self._refit(current, _drop_effects(current.numbers, [name]))
                     gains[name] = self.gain(less, current)
@@ -406,7 +416,7 @@ class EffectSearch:
             else:
                 less = self._as_stated(current) if thorough and self.fits is self.rough else None
                 if less is None:
-                    return current, gains
+                    return current, gains, plainer
                 current = less
 
     def _as_stated(self, current: FittedModel) -> FittedModel | None:
@@ -419,9 +429,9 @@ class EffectSearch:
         self.fits = self.stated
         return less
 
-    def _simplify(self, current: FittedModel, name: str) -> FittedModel | None:
-        """Put a special case of an effect in its place, if the effect gains nothing over that."""
-        place = name.partition(".")[0]
+    def _try_plainer(self, current: FittedModel, name: str) -> list[Trial]:
+        """Put special cases of an effect in its place, up to one over which it gains nothing."""
+        place, trials = name.partition(".")[0], list[Trial]()
         for kind, reduced in EFFECTS[name].special_cases.items():
             plain = f"{place}.{kind}"
             if plain not in self.lacking or plain in current.names:
@@ -432,10 +442,11 @@ class EffectSearch:
             }
             less = self._refit(current, numbers)
             gain = self.gain(less, current)
-            self._note(f"replace {name} by {plain}", gain, not gain.is_accepted, gain.rule, loss=True)
+            self._note(describe_change(current.numbers, numbers), gain, not gain.is_accepted, gain.rule, loss=True)
+            trials.append(Trial((plain,), less, gain))
             if not gain.is_accepted:
-                return less
-        return None
+                break
+        return trials
 
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit models with another effect in place of one, of the best that were accepted in its round."""

@@ -9,19 +9,19 @@ import numpy as np
 
 from jaxbl.chain import Experiment
 from jaxbl.config import Config
-from jaxbl.drive.parameters import leaf_paths, set_leaves
+from jaxbl.drive.parameters import leaf_paths
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
 from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
-from .free_parameters import FreeParameter, set_free_parameters
-from .intervals import NORMAL, UNSEEN, Profile, Refusal, Spread, interval, spread
+from .free_parameters import set_free_parameters
+from .intervals import NORMAL, Profile, Refusal, interval
 from .logs import LogTask, decimation
-from .regression import Kinematics, MotionShare, errors, regress
+from .regression import Kinematics, MotionShare, errors
 from .search import SearchFit, is_noise
 from .segments import at_period, long_enough, reading_noise, segments_of, windows_of
-from .trajectory import Fit, eliminate_starts
+from .trajectory import eliminate_starts
 
 
 def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
@@ -80,9 +80,9 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
     return derived
 
 
-def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: Spread) -> dict[str, Quantity]:
+def _parameters(record: Record, search_fit: SearchFit) -> dict[str, Quantity]:
     """Values with standard errors and 95 % intervals, by path."""
-    theta, deviation = fit.theta, np.sqrt(np.diag(width.covariance))
+    deviation = np.sqrt(np.diag(search_fit.spread.covariance))
     return {
         parameter.path: Quantity(
             float(parameter.value(coordinate)),
@@ -91,31 +91,7 @@ def _parameters(record: Record, free: Sequence[FreeParameter], fit: Fit, width: 
             record.unit_of(parameter.path, parameter.unit),
             parameter.nominal,
         )
-        for parameter, coordinate, error in zip(free, theta, deviation, strict=True)
-    }
-
-
-def by_regression(
-    nominal: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int, record: Record
-) -> JsonObject:
-    """Least squares on the equations of motion; numbers that they do not show are left out."""
-    regression_fit = regress(nominal, free, parts, factor)
-    information = np.einsum("wtsp,wtsq->pq", regression_fit.jacobian, regression_fit.jacobian)
-    values, vectors = np.linalg.eigh(information)
-    blind = values < 1.0 / UNSEEN**2
-    visible = np.all(np.abs(vectors[:, blind]) <= 0.1, axis=1)
-    parameters = _parameters(record, free, regression_fit, spread(regression_fit))
-    numbers = {path: jnp.asarray(parameter.value) for path, parameter in parameters.items()}
-    return {
-        "parameters": {
-            path: number.to_dict()
-            for (path, number), is_visible in zip(parameters.items(), visible, strict=True)
-            if is_visible
-        },
-        "measured_transmitted_torque": record.transmitted is not None,
-        "bandwidth": 0.5 / (factor * record.sample_period),
-        "torque": torque_errors(record, set_leaves(nominal, numbers), parts, factor),
-        "converged": regression_fit.converged,
+        for parameter, coordinate, error in zip(search_fit.free, search_fit.fit.theta, deviation, strict=True)
     }
 
 
@@ -146,7 +122,7 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
         correlation = width / np.outer(deviation, deviation)
-    numbers = _parameters(record, search_fit.free, search_fit.fit, search_fit.spread)
+    numbers = _parameters(record, search_fit)
     parameters = {path: number.to_dict() for path, number in numbers.items()}
     for path, profile in profiles.items():
         parameters[path] |= {

@@ -1,8 +1,7 @@
 """Parameters of a machine from its log: the function behind `jaxbl identify`.
 
-A trajectory fit with intervals, and beside it what else a log allows: the equations of motion at smoothed kinematics (and
-the measured transmitted torque, if there is one), and the paper's chain, the study's observers run on the recorded positions
-with the recursive identifier (27)-(28) on their equivalent control.
+A trajectory fit with intervals, and beside it the paper's chain, the study's observers run on the recorded positions with
+the recursive identifier (27)-(28) on their equivalent control.
 """
 
 import dataclasses
@@ -24,7 +23,7 @@ from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
 from .feedback_bias import find_feedback_bias
 from .free_parameters import FreeParameter, free_values, make_free_parameters
-from .identification_summary import by_regression, by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
+from .identification_summary import by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, note_damping, observer_chain
 from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, on_record, read_with_holdout
@@ -156,8 +155,6 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         factor = decimation(config, record)
         parts = long_enough(segments, factor)
         method: JsonObject = {"recursive": recursive, "trajectory": by_trajectories(search_fit, record)}
-        if parts:
-            method["regression"] = by_regression(nominal, search_fit.free, parts, factor, record)
         done()
         summary = summary_of(task, fitted, search_fit, profiles) | {"method": method}
         summary["torque"] = torque_errors(record, fitted, parts, factor)

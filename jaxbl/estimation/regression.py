@@ -1,4 +1,4 @@
-"""Regression on the equations of motion: torques that are left over at known kinematics, and the numbers that leave least.
+"""Equations of motion at known kinematics: torques that they leave over.
 
 What is commonly done with a log (inverse dynamics, ordinary least squares on filtered derivatives), and what a measured
 transmitted torque allows without any observer. Residual and regressors pass one decimation filter.
@@ -17,19 +17,9 @@ from jaxtyping import Array, Float
 
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import AbstractEffect
-from jaxbl.drive.plant import EffectStates, Plant, PlantState
+from jaxbl.drive.plant import EffectStates, Plant
 from jaxbl.fused.compilation import jit
-from jaxbl.records.least_squares import BlockRegression, column_rms
-
-from .descent import descend, linearise
-from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
-from .trajectory import Fit
-
-_PASSES = 3
-"""Fits, each with the weights of the residuals of the one before."""
-_MOST_STEPS, _SETTLED = 200, 1e-9
-"""Of each fit, and the share of its squares that a step gains which is its last."""
-
+from jaxbl.records.least_squares import BlockRegression
 
 Samples = Float[Array, " samples"]
 SideSamples = dict[str, Samples]
@@ -243,7 +233,7 @@ def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
     return jnp.convolve(values, jnp.asarray(firwin(20 * factor + 1, 1.0 / factor), values.dtype), "valid")[::factor]
 
 
-def _decimate_balances(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, Balance]:
+def decimate_balances(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, Balance]:
     """Equations of motion after decimation, all parts one after the other."""
     balances: dict[str, list[Balance]] = {}
     for part in parts:
@@ -255,7 +245,7 @@ def _decimate_balances(experiment: Experiment, parts: Sequence[Kinematics], fact
 def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
     """Measure how far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
     figures = {}
-    for name, equation in _decimate_balances(experiment, parts, factor).items():
+    for name, equation in decimate_balances(experiment, parts, factor).items():
         left, drive = (float(jnp.sqrt(jnp.mean(torque**2))) for torque in equation)
         figures[name] = {"rms": left, "relative": left / drive if drive > 0.0 else float("nan")}
     return figures
@@ -288,7 +278,7 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
     tenths; None if there is none.
     """
     shares = []
-    for side, equation in _decimate_balances(experiment, parts, factor).items():
+    for side, equation in decimate_balances(experiment, parts, factor).items():
         torque = np.asarray(equation.residual)
         # in each range and block some samples
         if side not in experiment.sides or len(torque) < 2 * _BLOCKS * _BINS:
@@ -306,56 +296,3 @@ def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray
     ranges = np.eye(_BINS)[np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)]
     left = BlockRegression.of(torque, ranges, _BLOCKS).held_out()
     return np.array([np.mean(part**2) for part in np.array_split(torque, _BLOCKS)]) - left
-
-
-class _Point(NamedTuple):
-    """Torques that are left over at a theta, weighted, shape (samples, equations), their derivative, and their squares."""
-
-    theta: np.ndarray
-    residual: np.ndarray
-    slope: np.ndarray
-    deviance: float
-
-
-@jit
-def _miss_torques(
-    experiment: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int, theta: Array
-) -> tuple[Array, Array]:
-    """Torques that the equations of motion leave over after decimation, shape (samples, equations), and their derivative."""
-
-    def miss(theta: Array) -> tuple[Array, Array]:
-        balances = _decimate_balances(set_free_parameters(experiment, free, theta), parts, factor)
-        missed = jnp.stack([equation.residual for equation in balances.values()], axis=-1)
-        return missed, missed
-
-    slope, missed = jax.jacfwd(miss, has_aux=True)(theta)
-    return missed, slope
-
-
-def regress(experiment: Experiment, free: Sequence[FreeParameter], parts: Sequence[Kinematics], factor: int) -> Fit:
-    """Least squares on all equations of motion from the nominal values, each equation weighted by what it leaves over.
-
-    Parts shorter than the filter of :func:`decimate` must be left out. Residuals and derivatives of the fit have shape
-    (1, samples, equations, ...), for :func:`jaxbl.estimation.intervals.spread`.
-    """
-    precision = np.full(len(free), PRIOR_DEVIATION**-2.0)
-
-    def evaluate(theta: np.ndarray, weights: np.ndarray | float = 1.0) -> _Point:
-        missed, slope = map(np.asarray, _miss_torques(experiment, free, parts, factor, jnp.asarray(theta)))
-        missed = missed * weights
-        deviance = float(np.sum(missed**2) + np.sum(precision * theta**2))
-        return _Point(theta, missed, slope * np.expand_dims(weights, -1), deviance)
-
-    best, ended = evaluate(np.zeros(len(free))), True
-    for _ in range(_PASSES):
-        left = column_rms(evaluate(best.theta).residual)
-        weights = 1.0 / np.maximum(left, np.finfo(float).tiny)
-        best, ended = descend(
-            evaluate(best.theta, weights),
-            lambda point: linearise(point.residual, point.slope, point.theta, precision),
-            lambda point, change, weights=weights: evaluate(point.theta + change, weights),
-            _MOST_STEPS,
-            lambda point: _SETTLED * point.deviance,
-        )
-    residual, slope = best.residual[None], best.slope[None]
-    return Fit(best.theta, PlantState({}, {}, ()), residual, slope, ended)

@@ -10,10 +10,19 @@ from jaxbl.diagnosis.effect_search import Gain
 from jaxbl.diagnosis.thresholds import LIMITS
 
 
-def explain(confidences, standard_errors=2.0):
-    """An explanation by effects of some confidence, each better by blocks by so many standard errors."""
+def explain(confidences, standard_errors=2.0, plain=None):
+    """An explanation by effects of some confidence, each better by blocks by so many standard errors.
+
+    `plain`: odds of a plain law of the first, and standard errors by which that is better than it.
+    """
     gains = dict.fromkeys(confidences, Gain(50.0, standard_errors))
-    return SimpleNamespace(fitted=SimpleNamespace(names=tuple(confidences)), gains=gains, confidences=confidences)
+    plainer = {name: [] for name in confidences}
+    if plain is not None:
+        plainer[next(iter(plainer))].append(SimpleNamespace(odds=plain[0], gain=Gain(20.0, plain[1])))
+    return SimpleNamespace(
+        fitted=SimpleNamespace(names=tuple(confidences)), gains=gains, confidences=confidences, plainer=plainer,
+        odds_of=lambda trial: trial.odds,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -21,8 +30,10 @@ def keep_likely(monkeypatch):
     """What is left of an explanation: names of effects, and in which order others went."""
     gone = []
 
-    def leave_out(explanation, name):
-        gone.append(name)
+    def leave_out(explanation, name, plain):
+        gone.append(name if plain is None else (name, plain.odds))
+        if plain is not None:
+            return explain(explanation.confidences)
         # what is left is surer without it
         less = {other: min(1.0, 2.0 * chance) for other, chance in explanation.confidences.items() if other != name}
         return explain(less, explanation.gains[name].standard_errors)
@@ -51,6 +62,12 @@ def test_the_least_likely_goes_first_and_the_others_are_weighed_anew(keep_likely
 
 def test_what_blocks_show_beyond_doubt_stays(keep_likely):
     assert keep_likely(explain({"motor.cogging": 0.1}, 1.1 * LIMITS.far)) == (("motor.cogging",), [])
+
+
+@pytest.mark.parametrize(("odds", "standard_errors", "goes"), [(2.0, 1.0, True), (0.5, 1.0, False), (2.0, 3.0, False)])
+def test_a_plain_law_takes_the_place_of_what_parts_it_from_something_unknown_alone(keep_likely, odds, standard_errors, goes):
+    explanation = explain({"motor.stribeck_friction": 0.9}, plain=(odds, standard_errors))
+    assert keep_likely(explanation) == (("motor.stribeck_friction",), [("motor.stribeck_friction", odds)] if goes else [])
 
 
 def test_what_is_known_to_act_stays(keep_likely):

@@ -14,9 +14,9 @@ from jaxbl.drive import make_effect
 NAME, RIVAL = "motor.coulomb_friction", "motor.viscous_friction"
 
 
-def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, left=0.0, **numbers):
-    """Return the finding; `rival`: what it gains over another effect; `unknown`: nats that a free function still gains;
-    `left`: torque that is still missing over its own."""
+def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, left=0.0, plain=None, **numbers):
+    """Return the finding; `rival`: what it gains over another effect, `plain`: over a plain law; `unknown`: nats that a free
+    function still gains; `left`: torque that is still missing over its own."""
     effect = make_effect(name, torque=0.1, **numbers)
     fitted = SimpleNamespace(
         names=(name,),
@@ -27,7 +27,9 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, l
     )
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
     remainder = {"motor.time": (unknown, 0.1)}
-    (finding,) = weigh(Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, remainder), 0.2 * left)  # type: ignore[arg-type]
+    plainer = [] if plain is None else [Trial((NAME,), fitted, Gain(*plain))]
+    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, remainder)  # type: ignore
+    (finding,) = weigh(explanation, 0.2 * left)
     return finding
 
 
@@ -62,6 +64,15 @@ def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(length,
     finding = weigh_effect(name="motor.presliding_friction", length=length)
     assert finding.confidence == pytest.approx(1.0 if sure else 0.5)
     assert finding.alternatives == (() if sure else ((NAME, 0.5),))
+
+
+@pytest.mark.parametrize(("unknown", "odds"), [(0.0, 0.0), (20.0, 1.0), (60.0, 9.0)])
+def test_a_finer_law_is_no_likelier_than_something_unknown_in_the_place_of_what_parts_it(unknown, odds):
+    finding = weigh_effect(name="motor.presliding_friction", length=0.1, plain=(20.0, 5.0), unknown=unknown)
+    # and the effect as a whole, which gains 50 nats
+    total = 1.0 + odds + (unknown / 50.0) ** 2
+    assert finding.confidence == pytest.approx(1.0 / total)
+    assert finding.alternatives == (((NAME, pytest.approx(odds / total)),) if odds else ())
 
 
 def test_what_the_fit_says_counts_only_if_blocks_agree():

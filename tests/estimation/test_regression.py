@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from filtered_derivatives import differentiate
+from inverse_dynamics import regress
 from measured import EMPS, find_recording
 from scipy import signal
 from small_study import rigid_study, small_study
@@ -19,7 +20,6 @@ from jaxbl.estimation.regression import (
     errors,
     kinematics_from,
     model_torques,
-    regress,
 )
 from jaxbl.estimation.smoother import smooth
 from jaxbl.records import read_record
