@@ -1,9 +1,8 @@
 """Equations of motion at known kinematics: torques that they leave over.
 
-What is commonly done with a log (inverse dynamics, ordinary least squares on filtered derivatives), and what a measured
-transmitted torque allows without any observer. Residual and regressors pass one decimation filter.
-References: M. Gautier, Dynamic identification of robots with power model, ICRA (1997); A. Janot, M. Gautier, M. Brunot, Data
-set and reference models of EMPS, Workshop on Nonlinear System Identification Benchmarks (2019).
+All torques pass one decimation filter.
+Reference: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System Identification
+Benchmarks (2019).
 """
 
 from collections.abc import Mapping, Sequence
