@@ -18,8 +18,8 @@ from size import ROOT, Size, measure_file, measure_folders
 # there from `estimation`. `report` pays for all; it has maps of the best observer at each point again, which docs/theory.md
 # shows. `drive` has a bound of what a flexible part is and, with `config`, friction under load of one inertia; `cli` and
 # `records` say first what a proposed model leaves open. `.` holds the first half of a sample's plant steps (`begin_sample`),
-# which derivatives share, and `cli` proposes no comparison where no point is common: 34 and 17 tokens. `diagnosis` asks for a
-# plain law where something unknown is likelier (299 tokens), for which `estimation` has no second fit of torques (777).
+# which derivatives share, and `cli` proposes no comparison where no point is common: 34 and 17 tokens. `diagnosis` asks for
+# a plain law where something unknown is likelier (299 tokens), for which `estimation` has no second fit of torques (777).
 CEILINGS = {
     "all": (381368, 0.02, 0.2, 0.0),
     "report": (44218, 0.04, 0.56, 0.0),

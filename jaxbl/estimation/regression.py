@@ -1,8 +1,8 @@
 """Equations of motion at known kinematics: torques that they leave over.
 
 All torques pass one decimation filter.
-Reference: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System Identification
-Benchmarks (2019).
+Reference: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System
+Identification Benchmarks (2019).
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,7 @@
 """How sure a finding is, by the fit and by blocks of the log."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, l
     """Return the finding; `rival`: what it gains over another effect, `plain`: over a plain law; `unknown`: nats that a free
     function still gains; `left`: torque that is still missing over its own."""
     effect = make_effect(name, torque=0.1, **numbers)
-    fitted = SimpleNamespace(
+    fitted: Any = SimpleNamespace(
         names=(name,),
         numbers={name: {"torque": 0.1} | numbers},
         experiment=SimpleNamespace(effects=(effect,)),
@@ -28,7 +29,7 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, l
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
     remainder = {"motor.time": (unknown, 0.1)}
     plainer = [] if plain is None else [Trial((NAME,), fitted, Gain(*plain))]
-    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, remainder)  # type: ignore
+    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, remainder)
     (finding,) = weigh(explanation, 0.2 * left)
     return finding
 
