@@ -1,6 +1,6 @@
 """Inverse dynamics: ordinary least squares on the equations of motion, as is commonly done with a log.
 
-It shares the equations with the package, and nothing of its fits: what numbers are compared with.
+Numbers of trajectory fits are compared with it. Equations and step control are the package's.
 Reference: M. Gautier, Dynamic identification of robots with power model, ICRA (1997).
 """
 

@@ -118,8 +118,8 @@ class Choice:
         return Chosen(explanation, fitted, compared, findings, closest, fits.given.drive, fits.prior, numbers_off)
 
     def _keep_likely(self, explanation: Explanation) -> tuple[Explanation, tuple[Finding, ...]]:
-        """Leave out effects in whose place something unknown is likelier, if blocks do not show them beyond doubt, and what
-        parts them from a plain law, if blocks do not surely show that."""
+        """Leave out effects in whose place something unknown is likelier, if blocks do not show them beyond doubt; take a
+        plain law of one where that is likelier, if by blocks the two do not differ."""
         while True:
             findings = weigh(explanation, self._find_missing(explanation.fitted)[0] if explanation.fitted.names else 0.0)
             asked = [finding for finding in findings if finding.effect not in self.search.expected]
@@ -136,7 +136,7 @@ class Choice:
             ]
             if not unlikely:
                 return explanation, findings
-            _, name, plain = min(unlikely, key=lambda finding: finding[0])
+            _, name, plain = min(unlikely, key=lambda doubt: doubt[0])
             explanation = self.search.leave_out(explanation, name, plain)
 
     def _find_missing(self, fitted: FittedModel) -> tuple[float, list[str]]:
