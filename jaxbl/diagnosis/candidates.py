@@ -146,8 +146,9 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
     """An effect at all values tried of the numbers that its torque is not proportional to."""
     roles = EFFECTS[name].roles()
     leaves = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
+    held = {leaf: role.neutral for leaf, role in roles.items() if role.kind == "held"}
     for values in itertools.product(*(roles[leaf].trials(log) for leaf in leaves)):
-        fixed = dict(zip(leaves, values, strict=True))
+        fixed = held | dict(zip(leaves, values, strict=True))
         if EFFECTS[name].sizes():
             yield _proportional(name, fixed, log)
             continue
@@ -156,6 +157,16 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
         remembers = remembers_input(_make_effect(name, **fixed)) and not EFFECTS[name].state_from_input
         for from_rest in (False, True) if remembers else (False,):
             yield _trial(name, fixed, from_rest)
+
+
+def release(name: str, numbers: Numbers, log: Scales) -> list[Candidate]:
+    """An effect that a model has, at the trial values of numbers that it holds."""
+    if EFFECTS[name].released(numbers):
+        return []
+    fixed = {leaf: value for leaf, value in numbers.items() if leaf not in EFFECTS[name].sizes()}
+    trials = {leaf: role.trials(log) for leaf, role in EFFECTS[name].roles().items() if role.kind == "held"}
+    finer = [fixed | dict(zip(trials, values, strict=True)) for values in itertools.product(*trials.values())]
+    return [_proportional(name, law, log) for law in finer if EFFECTS[name].released(law)]
 
 
 def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:

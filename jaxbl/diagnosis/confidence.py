@@ -13,7 +13,7 @@ from jaxbl.drive.parameters import get_leaf
 
 from .effect_search import Explanation
 from .expected_errors import Expected
-from .fitted_model import FittedModel, special_case
+from .fitted_model import FittedModel
 from .reference_log import Errors
 from .thresholds import LIMITS
 
@@ -55,13 +55,15 @@ def weigh(explanation: Explanation, left: float = 0.0) -> tuple[Finding, ...]:
 def _weigh(explanation: Explanation, name: str, left: float) -> Finding:
     fitted, gain = explanation.fitted, explanation.gains[name]
     odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
-    # what is still unknown may stand in its place: odds by the squares of gains, and of torques, part right from wrong on
-    # generated logs
-    unknown = max(explanation.largest_gain / max(gain.nats, 1.0), left / max(fitted.share(name), 1e-300)) ** 2
-    odds |= {trial.added[0]: explanation.odds_of(trial) for trial in explanation.plainer[name]}
-    if (plain := special_case(fitted, name)) is not None:
-        # as likely by the fit
-        odds[plain] = max(odds.get(plain, 0.0), 1.0)
+    # what is still unknown may stand in its place, or what laws of other effects miss: odds by the squares of gains, and of
+    # torques, part right from wrong on generated logs
+    parts = [
+        explanation.largest_gain / max(gain.nats, 1.0),
+        left / max(fitted.share(name), 1e-300),
+        fitted.missed_share(name) / max(fitted.own_share(name), 1e-300),
+    ]
+    unknown = max(parts) ** 2
+    odds |= {trial.added[0]: explanation.odds_of(trial) for trial in explanation.plainer[name] if trial.added[0] != name}
     total = 1.0 + sum(odds.values()) + unknown
     # no surer than that its torque is not zero, nor than that it makes the model better by blocks
     least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))

@@ -10,13 +10,13 @@ one that gains clearly says that something else is missing. What is less likely 
 again (:mod:`.choice`).
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from jaxbl.chain import Experiment
-from jaxbl.drive.effects import EFFECTS, AbstractEffect
+from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers
 from jaxbl.estimation.free_parameters import FreeParameter
 from jaxbl.records.least_squares import column_rms
 from jaxbl.workers import announce
@@ -30,6 +30,7 @@ from .candidates import (
     contains,
     is_finer_law,
     owner_of,
+    release,
     replaces,
     variants_of,
 )
@@ -254,12 +255,12 @@ class EffectSearch:
             visited.add(state)
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
-            current, gains, plainer = self._reduce(better or current, thorough=thorough)
+            current, *gained = self._reduce(better or current, thorough=thorough)
             if better is not None:
                 self.check_model(current)
             if better is not None or self._identify(current) not in visited:
                 continue
-            explanation = self._conclude(current, gains, plainer)
+            explanation = self._conclude(current, *gained)
             rivals = explanation.rivals
             accepted = [
                 (name, trial)
@@ -314,8 +315,11 @@ class EffectSearch:
 
     def _identify(self, fitted: FittedModel) -> tuple[bool, frozenset[tuple]]:
         """Tell models apart by what is known of the numbers, by their effects, and by the waves of these."""
-        waves = ((name, *(numbers[leaf] for leaf in _waves(name))) for name, numbers in fitted.numbers.items())
-        return self.fits is self.rough, frozenset(waves)
+        laws = (
+            (name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].released(numbers))
+            for name, numbers in fitted.numbers.items()
+        )
+        return self.fits is self.rough, frozenset(laws)
 
     def _next(self, current: FittedModel) -> FittedModel | None:
         """Find the best model with more effects that is accepted."""
@@ -334,7 +338,9 @@ class EffectSearch:
         if best is None:
             self.history.append(Step("add one more effect", None, None, False, "none of them gains enough on the log"))
             return None
-        self._tried |= {name: [trial for trial in accepted if trial is not best] for name in best.added}
+        self._tried |= {
+            name: [trial for trial in accepted if trial is not best] for name in best.added if name not in current.names
+        }
         return best.fitted
 
     def _try_all(self, current: FittedModel) -> list[Trial]:
@@ -374,21 +380,46 @@ class EffectSearch:
         old = {name: numbers for name, numbers in current.numbers.items() if not any(replaces(other, name) for other in new)}
         announce(f"trying {' + '.join([*old, *new])}")
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
-        fitted = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
-        # beside others, one may turn out to be nothing
-        gone = (
-            [] if fitted.foretold is None else [name for name in fitted.names if fitted.share(name) <= LIMITS.least_torque]
-        )
-        if not gone or not new.keys() - gone:
-            return Trial(tuple(new), fitted, self.gain(current, fitted))
-        if old.keys() & gone:
-            # it stood for the new ones: they are compared with the model that has neither
-            current = self._refit(current, _drop_effects(old, gone))
-        return self._try(current, proposal._replace(numbers=_drop_effects(new, gone)))
+        tried = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
+        fitted = self._simplify(tried)
+        left = [name for name in old if name in fitted.names or any(contains(name, plain) for plain in fitted.names)]
+        added = [
+            name
+            for name, values in fitted.numbers.items()
+            if (name not in current.names or EFFECTS[name].released(values))
+            and not any(other == name or contains(other, name) for other in left)
+        ]
+        if not added:
+            return Trial(tuple(new), tried, self.gain(current, tried))
+        if len(left) < len(old):
+            # what went stood for the new ones: they are compared with the model that has neither
+            current = self._refit(current, {name: old[name] for name in left})
+        return Trial(tuple(added), fitted, self.gain(current, fitted))
 
     def _refit(self, current: FittedModel, numbers: EffectNumbers, *added: str) -> FittedModel:
         """Fit a model with other effects, from the own numbers of one; `added`: those that are new there."""
-        return self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, added)
+        return self._simplify(self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, added))
+
+    def _simplify(self, fitted: FittedModel) -> FittedModel:
+        """Put plain laws in the place of effects that are no more than these beside the others; take out what is nothing."""
+        if fitted.foretold is None:
+            return fitted
+        numbers = dict[str, Numbers]()
+        for name, values in fitted.numbers.items():
+            if name in self.expected or fitted.counts(name):
+                numbers[name] = values
+            elif fitted.share(name) > LIMITS.least_torque:
+                # where there is no plain law, a model with it cannot be
+                numbers |= next(self._plain_laws(fitted, name), {name: values})
+        return fitted if numbers == fitted.numbers else self._refit(fitted, numbers)
+
+    def _plain_laws(self, fitted: FittedModel, name: str) -> Iterator[EffectNumbers]:
+        """Yield the plain laws of an effect that may stand in its place beside the others, with their numbers."""
+        place = name.partition(".")[0]
+        for kind, law in EFFECTS[name].plainer(fitted.numbers[name]).items():
+            plain = f"{place}.{kind}"
+            if plain == name or (plain in self.lacking and plain not in fitted.names):
+                yield {plain: law}
 
     def _reduce(
         self, current: FittedModel, *, thorough: bool
@@ -431,19 +462,13 @@ class EffectSearch:
 
     def _try_plainer(self, current: FittedModel, name: str) -> list[Trial]:
         """Put special cases of an effect in its place, up to one over which it gains nothing."""
-        place, trials = name.partition(".")[0], list[Trial]()
-        for kind, reduced in EFFECTS[name].special_cases.items():
-            plain = f"{place}.{kind}"
-            if plain not in self.lacking or plain in current.names:
-                continue
-            numbers = {
-                (plain if other == name else other): reduced(values) if other == name else values
-                for other, values in current.numbers.items()
-            }
+        trials = list[Trial]()
+        for law in self._plain_laws(current, name):
+            numbers = _drop_effects(current.numbers, [name]) | law
             less = self._refit(current, numbers)
             gain = self.gain(less, current)
             self._note(describe_change(current.numbers, numbers), gain, not gain.is_accepted, gain.rule, loss=True)
-            trials.append(Trial((plain,), less, gain))
+            trials.append(Trial((*law,), less, gain))
             if not gain.is_accepted:
                 break
         return trials
@@ -462,7 +487,8 @@ class EffectSearch:
             gain = self.gain(fitted, current)
             reason = f"{name if gain.is_accepted else 'neither'} is better by the same rule"
             self._note(f"replace {name} by {other}", gain, False, reason, loss=True)
-            rivals.append(trial._replace(fitted=fitted, gain=gain))
+            if other in fitted.names:
+                rivals.append(trial._replace(fitted=fitted, gain=gain))
         return rivals
 
     def _try_laws(self, current: FittedModel, name: str) -> list[Trial]:
@@ -504,6 +530,7 @@ class EffectSearch:
         """Propose effects that may be missing, most promising first."""
         linear, variants = self._vary(current, [name for name in self.lacking if name not in current.names])
         regression = self._regress(linear, current, variants)
+        finer = [law for name, numbers in current.numbers.items() for law in release(name, numbers, linear.scales(name))]
         ranked = self._rank(linear, current.names, variants, linear.best_predictor)
         if ranked:
             # a predictor chosen without an effect makes up for it
@@ -531,6 +558,9 @@ class EffectSearch:
         together = regression.propose_together()
         if len(together) > 1:
             proposals.append(_Proposal(together))
+        # no screening along a predictor's path foresees how a law with a memory changes it
+        laws = self._rank(linear, current.names, finer, linear.best_predictor, -np.inf)
+        proposals += [law._replace(nats=np.inf) for law in laws]
         return proposals
 
     def _regress(self, linear: Linear, current: FittedModel, variants: Sequence[Candidate]) -> TorqueRegression:

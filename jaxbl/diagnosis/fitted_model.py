@@ -74,11 +74,23 @@ class FittedModel(NamedTuple):
         """Torque of an effect along the log, rms over the driving torque's."""
         return self.linear.torque_share(get_leaf(self.experiment, f"effects.{name}"))
 
+    def own_share(self, name: str) -> float:
+        """Torque of an effect that no other number of the model makes up for, as :meth:`share`."""
+        inflation = np.diag(self.white) * np.diag(np.linalg.inv(self.white))
+        sizes = {f"effects.{name}.{leaf}" for leaf in EFFECTS[name].sizes()}
+        least = min((float(inflation[i]) for i, number in enumerate(self.free) if number.path in sizes), default=1.0)
+        return self.share(name) / least**0.5
+
+    def missed_share(self, name: str) -> float:
+        """Torque that laws of the other effects may miss, as :meth:`share`."""
+        others = [effect for effect in self.experiment.effects if type(effect).law_error and effect.name != name]
+        return float(np.linalg.norm([type(effect).law_error * self.linear.torque_share(effect) for effect in others]))
+
     def counts(self, name: str) -> bool:
         """Tell whether the log shows an effect, and its torque is large enough to be named; of a finer law, what parts it
         from the plain one has to be, too."""
         effect, place, numbers = get_leaf(self.experiment, f"effects.{name}"), name.partition(".")[0], self.numbers[name]
-        plain = [make_effect(f"{place}.{kind}", **to(numbers)) for kind, to in EFFECTS[name].special_cases.items()]
+        plain = [make_effect(f"{place}.{kind}", **law) for kind, law in EFFECTS[name].plainer(numbers).items()]
         return self.linear.shows(name, numbers) and all(
             self.linear.torque_share(effect, *less) > LIMITS.least_torque for less in [(), *zip(plain)]
         )
@@ -104,13 +116,3 @@ class FittedModel(NamedTuple):
             value, slope = float(number.value(theta)), float(number.slope(theta))
             values[number.path] = max(value + slope * step, LEAST_LEFT * value) if number.positive else value + slope * step
         return set_leaves(self.experiment, arrays(values))
-
-
-def special_case(fitted: FittedModel, name: str) -> str | None:
-    """Name of a special case that an effect of a model may as well be, since the number that parts the two is known no
-    better than its size: friction that bends over a length of 0.5 ± 0.6 mrad may as well not bend."""
-    cls, errors, place = EFFECTS[name], fitted.errors(), name.partition(".")[0]
-    paths = [f"effects.{name}.{leaf}" for leaf, role in cls.roles().items() if role.kind in ("shape", "frequency")]
-    apart = [errors[path] < abs(float(get_leaf(fitted.experiment, path))) for path in paths if path in errors]
-    plain = next((f"{place}.{kind}" for kind in cls.special_cases), None)
-    return plain if apart and not any(apart) else None

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.json_types import JsonObject
 
 
@@ -29,9 +30,15 @@ def describe_history(history: Sequence[Step]) -> list[JsonObject]:
     return [dict(zip(("tried", "nats", "standard_errors", "kept", "why"), step, strict=True)) for step in history]
 
 
-def describe_change(before: Mapping[str, object], after: Mapping[str, object]) -> str:
-    """Say which effects one model has that another has not: `add A`, `remove A`, `replace A by B`."""
-    gone, new = (" and ".join(sorted(set(a) - set(b))) for a, b in ((before, after), (after, before)))
+def describe_change(before: Mapping[str, Numbers], after: Mapping[str, Numbers]) -> str:
+    """Say which effects one model has that another has not, or numbers that are held by default: `add A`, `remove A`,
+    `replace A by B`."""
+    both = before.keys() & after.keys()
+    parts = [
+        {*model, *(f"{name}.{leaf}" for name in both for leaf in EFFECTS[name].released(model[name]))}
+        for model in (before, after)
+    ]
+    gone, new = (" and ".join(sorted(a - b)) for a, b in (parts, parts[::-1]))
     if gone and new:
         return f"replace {gone} by {new}"
     return f"add {new}" if new else f"remove {gone}"

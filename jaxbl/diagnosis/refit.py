@@ -156,7 +156,7 @@ class _Fit:
         self.free, self.added = (*fits.free, *free), np.array(theta)
         self.width = np.concatenate([prior, width])
         choices = sum(fits.given.choices(name) for name in numbers)
-        general = sum(is_finer_law(name) for name in numbers)
+        general = sum(is_finer_law(name) + bool(EFFECTS[name].released(numbers[name])) for name in numbers)
         self.log_odds = fits.log_odds + LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> FitPoint:
@@ -307,7 +307,7 @@ class _Fit:
     def _release(self, fitted: FittedModel) -> FittedModel:
         """Give effects what is wrong with numbers that are free; the log tells their sums alone."""
         for name, i in self.released.items():
-            number, (path,) = self.fits.free[i], paths_of([name])
+            number, (path,) = self.fits.free[i], paths_of({name: self.numbers[name]})
             value, slope = (float(of(fitted.theta[i])) for of in (number.value, number.slope))
             numbers = {path: value - number.nominal, number.path: number.nominal}
             experiment = set_leaves(complete(fitted.experiment, [name]), arrays(numbers))
@@ -349,13 +349,13 @@ def leave_quarters_out(errors: np.ndarray, slopes: np.ndarray, prior: np.ndarray
     )
 
 
-def paths_of(names: Sequence[str] | EffectNumbers) -> list[str]:
+def paths_of(effects: EffectNumbers) -> list[str]:
     """Return the dotted paths of the numbers of effects that are fitted: a harmonic is a whole number, and some are held."""
     return [
         f"effects.{name}.{leaf}"
-        for name in names
+        for name, numbers in effects.items()
         for leaf, role in EFFECTS[name].roles().items()
-        if role.kind not in ("harmonic", "held")
+        if role.kind not in ("harmonic", "held") or leaf in EFFECTS[name].released(numbers)
     ]
 
 

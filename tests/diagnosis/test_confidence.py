@@ -15,15 +15,18 @@ from jaxbl.drive import make_effect
 NAME, RIVAL = "motor.coulomb_friction", "motor.viscous_friction"
 
 
-def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, left=0.0, plain=None, **numbers):
+def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, left=0.0, plain=None, missed=0.0, **numbers):
     """Return the finding; `rival`: what it gains over another effect, `plain`: over a plain law; `unknown`: nats that a free
-    function still gains; `left`: torque that is still missing over its own."""
+    function still gains; `left`: torque that is still missing over its own; `missed`: by laws of others, over its own
+    part."""
     effect = make_effect(name, torque=0.1, **numbers)
     fitted: Any = SimpleNamespace(
         names=(name,),
         numbers={name: {"torque": 0.1} | numbers},
         experiment=SimpleNamespace(effects=(effect,)),
         share=lambda name: 0.2,
+        own_share=lambda name: 0.05,
+        missed_share=lambda name: 0.05 * missed,
         errors=lambda: {f"effects.{name}.torque": error} | {f"effects.{name}.{leaf}": 0.1 * error for leaf in numbers},
     )
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
@@ -60,11 +63,9 @@ def test_no_finding_is_surer_than_held_out_data_make_it():
     assert confirm([tied], {NAME: 6.0})[0].confidence == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(("length", "sure"), [(0.1, True), (1e-5, False)])
-def test_a_special_case_is_as_likely_where_the_fit_does_not_part_the_two(length, sure):
-    finding = weigh_effect(name="motor.presliding_friction", length=length)
-    assert finding.confidence == pytest.approx(1.0 if sure else 0.5)
-    assert finding.alternatives == (() if sure else ((NAME, 0.5),))
+def test_an_effect_is_no_surer_than_that_laws_of_others_do_not_miss_its_torque():
+    chances = [weigh_effect(missed=missed).confidence for missed in (0.0, 0.2, 1.0, 3.0)]
+    assert chances == [pytest.approx(chance) for chance in (1.0, 1.0 / 1.04, 0.5, 0.1)]
 
 
 @pytest.mark.parametrize(("unknown", "odds"), [(0.0, 0.0), (20.0, 1.0), (60.0, 9.0)])

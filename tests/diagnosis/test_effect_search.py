@@ -13,7 +13,7 @@ from hidden_log import nominal_study, simulate_direct_drive, simulate_multisine_
 from jaxbl.diagnosis import effect_search
 from jaxbl.diagnosis.candidates import NO_CANDIDATE, Candidate
 from jaxbl.diagnosis.confidence import weigh
-from jaxbl.diagnosis.effect_search import EffectSearch
+from jaxbl.diagnosis.effect_search import EffectSearch, _Proposal
 from jaxbl.diagnosis.evidence import Products
 from jaxbl.diagnosis.reference_log import ReferenceLog
 from jaxbl.diagnosis.thresholds import LIMITS
@@ -116,6 +116,34 @@ def test_friction_beyond_coulombs_is_named_with_its_numbers(name, tmp_path):
     assert explanation.largest_gain < LIMITS.unknown and explanation.fitted.names == (name,)
     for key, value in HIDDEN[name].items():
         assert explanation.fitted.numbers[name][key] == pytest.approx(value, rel=0.02)
+
+
+def test_a_finer_law_that_is_no_more_than_the_plain_one_gives_way_to_it(tmp_path):
+    """So a model with several effects is no worse for a law that one of them need not have."""
+    hidden = [{"kind": "motor.coulomb_friction", "torque": 0.06}, {"kind": "motor.constant_torque", "torque": 0.03}]
+    simulate_direct_drive(simulate_multisine_log().u[:1000], hidden, 3e-5, 1).write(tmp_path / "log.csv")
+    search = prepare_search(tmp_path / "log.csv", nominal_study())
+    nominal = search.fits.fit({}, np.zeros(len(search.fits.prior)))
+    drifting = {"torque": 0.05, "initial_torque": 0.05, "time_constant": 1.0}
+    trial = search._try(nominal, _Proposal({"motor.drifting_friction": drifting, "motor.constant_torque": {"torque": 0.02}}))
+    assert set(trial.added) == set(trial.fitted.names) == {effect["kind"] for effect in hidden}
+    assert trial.gain.is_accepted
+
+
+def test_friction_that_bends_and_falls_is_one_law(tmp_path):
+    """Without it a drag stands for the fall."""
+    axis = Axis(0.02, 0.03, 0.06, rise=1.5, fall=1.0, length=5e-3)
+    time = 4e-3 * np.arange(1000)
+    rate = 1.5 * np.cos(2.0 * np.pi * 0.35 * time) + 0.8 * np.cos(2.0 * np.pi * 0.62 * time)
+    drive = Drive(4e-3, 6.0, 0.6, 3.0, 0.5, 2.0, motor_step=1e-5)
+    run = simulate(axis, drive, np.cumsum(rate) * 4e-3, rate, np.ones(len(time), bool))
+    table = np.column_stack([time, run.command, run.readings[:, 0]])
+    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
+    numbers = prepare_search(tmp_path / "log.csv", nominal_study(run={"sample_period": 4e-3})).run().fitted.numbers
+    assert list(numbers) == ["motor.presliding_friction"]
+    friction = numbers["motor.presliding_friction"]
+    assert friction["torque"] == pytest.approx(axis.friction, rel=0.05)
+    assert friction["breakaway_ratio"] == pytest.approx(axis.rise, rel=0.05)
 
 
 def test_waves_a_turn_are_found_wherever_they_are_and_beside_friction(tmp_path):

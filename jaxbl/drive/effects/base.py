@@ -92,7 +92,7 @@ class Role(NamedTuple):
     Attributes:
         kind: `size`: the torque is proportional to the number. `angle`: a phase, rad. `harmonic`: a number of periods a
             turn, which is chosen among trial values and not fitted. `frequency`: Hz. `shape`: any other positive number.
-            `held`: a diagnosis leaves it neutral.
+            `held`: neutral, unless a finer law with one of its trial values is likelier.
         neutral: the number with which the effect does nothing.
         trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
@@ -140,10 +140,13 @@ def shape(unit: str, doc: str, trials: Callable[[Scales], Sequence[float]], *, n
     return parameter(unit, doc, role=Role("shape", neutral, trials), **limits)
 
 
-def held(unit: str, doc: str, neutral: float, **limits: Any) -> Any:
-    """Declare a number for simulations, by default `neutral`. A diagnosis leaves it neutral; an identification fits it only
-    if the study sets it or asks for it."""
-    return parameter(unit, doc, default=neutral, role=Role("held", neutral, lambda log: (neutral,)), **limits)
+def held(
+    unit: str, doc: str, neutral: float, trials: Callable[[Scales], Sequence[float]] | None = None, **limits: Any
+) -> Any:
+    """Declare a number that is `neutral` by default. A diagnosis leaves it there unless it has `trials`; an identification
+    fits it only if the study sets it or asks for it."""
+    role = Role("held", neutral, (lambda log: (neutral,)) if trials is None else trials)
+    return parameter(unit, doc, default=neutral, role=role, **limits)
 
 
 def table(unit: str, doc: str) -> Any:
@@ -168,6 +171,7 @@ class AbstractEffect(eqx.Module):
         rotary: True if only a rotary motor has it: a diagnosis of a linear axis does not seek it.
         in_log: words that say how it is taken off a log, if it is an error of the recording: a diagnosis asks for it first.
         corrects: the number of the drive whose error it is: `inertia` or `viscous`.
+        law_error: share of its torque by which machines depart from its law.
         exclusive: a word; a place has at most one effect with the same word.
         special_cases: simpler kinds at the same place that it contains, each with a function from its numbers to theirs.
     """
@@ -181,6 +185,7 @@ class AbstractEffect(eqx.Module):
     rotary = False
     in_log = ""
     corrects: ClassVar[str | None] = None
+    law_error = 0.0
     exclusive: ClassVar[str | None] = None
     special_cases: ClassVar[Mapping[str, Callable[[Numbers], Numbers]]] = {}
 
@@ -287,6 +292,18 @@ class AbstractEffect(eqx.Module):
     def sizes(cls) -> list[str]:
         """Names of the numbers that its torque is proportional to."""
         return [name for name, role in cls.roles().items() if role.kind == "size"]
+
+    @classmethod
+    def released(cls, numbers: Numbers) -> list[str]:
+        """Names of the numbers that are held by default, and are not neutral."""
+        return [name for name, role in cls.roles().items() if role.kind == "held" and numbers[name] != role.neutral]
+
+    @classmethod
+    def plainer(cls, numbers: Numbers) -> dict[str, Numbers]:
+        """Plain laws of an effect with these numbers, by kind: itself with what is held by default, and special cases."""
+        neutral = {name: cls.neutral()[name] for name in cls.released(numbers)}
+        itself = {cls.kind: {**numbers, **neutral}} if neutral else {}
+        return itself | {kind: reduced(numbers) for kind, reduced in cls.special_cases.items()}
 
     @classmethod
     def directions(cls) -> Sequence[Numbers]:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 
 from ..parameters import Scalar
 from .base import EFFECTS, Scales, TransmissionEffect, angle, harmonic, multiples, shape, size
+from .friction import DryFriction
 
 _GAPS = 0.01, 0.02, 0.04, 0.08, 0.12, 0.18, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92
 """Trial values of the half gap, over the largest twist: a larger gap leaves no contact, a smaller one hardly any play."""
@@ -133,6 +134,7 @@ class LoadFriction(TransmissionEffect):
     """
 
     kind = "load_friction"
+    law_error = DryFriction.law_error
     coefficient: Scalar = size("", "friction torque over transmitted torque, mu", minimum=0.0)
 
     @classmethod
