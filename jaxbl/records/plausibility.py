@@ -226,7 +226,7 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     if work_share < -0.1:
         returned_text = f"the drive returns {-100 * work_share:.0f} % of the work"
         file.warnings.append(f"{DOUBT}{returned_text}: the load drives it, or u has the wrong sign or acts late.")
-        # a lag turns the torque of an inertia against the speed; a wrong sign turns it against the acceleration, too
+        # a lag may do it: see `flag_wrong_units`
         if work_share < _MAX_RETURNED_WORK and not accelerates_with_torque:
             file.contradiction = (
                 f"{returned_text}, as only a drive with a driving load does: set sign = -1 in [log] u, or take a log in "
@@ -303,8 +303,10 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         file.warnings.append(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
     same_direction = has_odd_friction and (power_ratio > 1.0) == (ratio > 1.0)
-    # friction that falls with the speed takes work none the less
-    if friction_power < 0.0 and shows_viscous and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0:
+    # friction that falls with the speed takes work none the less; a lag turns the torque of an inertia against the speed, a
+    # wrong sign against the acceleration, too
+    is_reversed = friction_power < 0.0 and shows_viscous and not inertia > 3.0 * rigid_fit.errors[0]
+    if is_reversed and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0:
         file.contradiction = (
             f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "
             f"{nominal_viscous:.3g}: set sign = -1 in [log] u"
