@@ -81,41 +81,32 @@ def check_sizes(data: Any) -> None:
         InputError: nested too deep, too many values, a number of impossible size, a long name or text, or control
             characters in it. The message names the key.
     """
-    count = 0
-    # a stack in place of recursion, which deep data would break
-    stack = [iter([("", data)])]
-    while stack:
-        member = next(stack[-1], None)
-        if member is None:
-            stack.pop()
-            continue
-        key, value = member
-        count += 1
+    for count, _ in enumerate(_check_members("", data, 0), 1):
         if count > _VALUE_COUNT:
             raise InputError(
                 f"holds more than {_VALUE_COUNT} values; give axes by start, stop and num, inputs as a recorded file"
             )
-        if isinstance(value, dict | list | tuple):
-            if len(stack) > _NESTING_DEPTH:
-                raise InputError(
-                    f"{shorten(key, _KEY_LENGTH)}: tables or arrays within one another; "
-                    f"at most {_NESTING_DEPTH} are possible"
-                )
-            stack.append(_iterate_members(key, value))
-        elif fault := _find_fault(value):
+
+
+def _check_members(key: str, value: Any, depth: int) -> Iterator[None]:
+    """Check a value, then its members and theirs if it is a table or an array; yield before each."""
+    yield
+    if not isinstance(value, dict | list | tuple):
+        if fault := _find_fault(value):
             raise InputError(f"{shorten(key, _KEY_LENGTH)}: {fault}")
-
-
-def _iterate_members(key: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the members of a table or an array, with the full key of each."""
-    if not isinstance(value, Mapping):
-        yield from ((f"{key}[{i}]", member) for i, member in enumerate(value))
         return
-    for name, member in value.items():
-        member_key = f"{key}.{name}" if key else str(name)
-        if fault := _find_fault(str(name), _KEY_LENGTH):
-            raise InputError(f"{shorten(member_key, _KEY_LENGTH)}: a key {fault}")
-        yield member_key, member
+    if depth == _NESTING_DEPTH:
+        raise InputError(
+            f"{shorten(key, _KEY_LENGTH)}: tables or arrays within one another; at most {_NESTING_DEPTH} are possible"
+        )
+    is_table = isinstance(value, dict)
+    for name, member in value.items() if is_table else enumerate(value):
+        member_key = f"{key}[{name}]"
+        if is_table:
+            member_key = f"{key}.{name}" if key else str(name)
+            if fault := _find_fault(str(name), _KEY_LENGTH):
+                raise InputError(f"{shorten(member_key, _KEY_LENGTH)}: a key {fault}")
+        yield from _check_members(member_key, member, depth + 1)
 
 
 def _find_fault(value: Any, text_length: int = _TEXT_LENGTH) -> str:
