@@ -47,6 +47,16 @@ def to_path(name: str | Path) -> Path:
         ) from None
 
 
+def find_shipped_study(name: str) -> Path:
+    """Find a study that comes with the package; in a clone it lies beside the package. Raises `InputError` if it is lost."""
+    package = Path(__file__).parent
+    places = package / "studies" / name, package.parent / "sweeps" / name
+    for file in places:
+        if file.is_file():
+            return file
+    raise InputError(f"{places[0]}: no such file; install jaxbl anew, it comes with it")
+
+
 def is_remote(path: Path) -> bool:
     """True if a path is in an object store, where files are always whole, and there are no folders and no locks."""
     return not isinstance(path, Path)

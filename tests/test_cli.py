@@ -47,6 +47,7 @@ from jaxbl.files import lock_folder
 from jaxbl.lines import NextStep, program_name
 from jaxbl.result import Result
 from jaxbl.sweeps.engine import Engine
+from jaxbl.throughput.studies import STUDIES
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
 FIGURE = {"kind": "line", "x": ALPHA, "value": "motor.velocity_rmse"}
@@ -1088,11 +1089,11 @@ def test_completion_knows_the_commands(tmp_path):
 
 
 def test_the_demo_is_the_study_of_the_tree_or_of_the_wheel():
-    shipped_study = setup._find_shipped_study("gain_map.toml")
+    shipped_study = setup.find_shipped_study("gain_map.toml")
     assert shipped_study.is_file() and shipped_study.name == "gain_map.toml"
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
     files = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
-    assert files == {"sweeps/gain_map.toml": "jaxbl/studies/gain_map.toml"}
+    assert files == {f"sweeps/{name}.toml": f"jaxbl/studies/{name}.toml" for name in STUDIES}
 
 
 def read_steps(content):
@@ -1107,7 +1108,7 @@ def read_page_text(path):
 
 def test_what_the_demo_says_to_try_next_works_as_it_stands(call, tmp_path, monkeypatch):
     study = write_study(tmp_path, tunable_study() | {"axes": GAINS, "notes": ["The question: which gains?"]}, "a map.toml")
-    monkeypatch.setattr(setup, "_find_shipped_study", lambda name: study)
+    monkeypatch.setattr(setup, "find_shipped_study", lambda name: study)
     code, lines, _ = call("demo", "--out", "results/a map")
     assert code == 0 and lines[-1] == "results/a map/report.html"
     steps = read_steps(call("demo", "--out", "results/a map", "--json")[1])

@@ -21,7 +21,7 @@ from jaxbl.datasheet import (
     write_first_study,
 )
 from jaxbl.errors import InputError
-from jaxbl.files import Subject, open_results, write_atomic
+from jaxbl.files import Subject, find_shipped_study, open_results, write_atomic
 from jaxbl.lines import format_descriptions
 from jaxbl.result import Result
 from jaxbl.terminal import STEPS, can_ask_user, run_with_progress, show_task
@@ -203,18 +203,8 @@ def demo(
 
     Read on: README.md
     """
-    config = _find_shipped_study("gain_map.toml")
+    config = find_shipped_study("gain_map.toml")
     return compute(context, config, read_study(context, config), jaxbl.sweep, "map", after_demo)
-
-
-def _find_shipped_study(name: str) -> Path:
-    """Find a study that comes with the package; in a clone it lies beside the package."""
-    package = Path(__file__).parents[1]
-    places = package / "studies" / name, package.parent / "sweeps" / name
-    for file in places:
-        if file.is_file():
-            return file
-    raise InputError(f"{places[0]}: no such file; install jaxbl anew, it comes with it")
 
 
 def bench(

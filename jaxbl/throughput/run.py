@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxbl.errors import NoResult
 from jaxbl.json_types import JsonObject
-from jaxbl.workers import Progress, count_cores
+from jaxbl.workers import Progress, count_cores, make_stage_counter
 
 from .jaxbl_chain import FusedChain, ScanChain
 from .rivals.cpp_chain import CppChain, NoCompiler, compile_library, find_compiler
@@ -53,6 +53,18 @@ class Entry(NamedTuple):
     make: Callable[[Workload], Runner]
     lanes: int  # that it is given, as many as it can bear
     module: str | None = None  # a module it cannot do without
+
+    def prepare(self, workload: Workload) -> Runner:
+        """Make the entry for a workload; it is made and called in the workload's precision."""
+        enable_precision = partial(jax.enable_x64, workload.precision == "float64")
+        with enable_precision():
+            runner = self.make(workload)
+
+        def run() -> Metrics:
+            with enable_precision():
+                return runner()
+
+        return run
 
 
 def make_entries(folder: Path, threads: int, devices: int) -> list[Entry]:
@@ -152,50 +164,37 @@ def _measure(folder: Path, threads: int, quick: bool, progress: Progress | None)
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [(entry, precision) for precision in PRECISIONS for entry in runnable if _is_timed(entry, precision, quick)]
     curve_lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
-    compared = list(STUDIES) if any(entry.name == CPP_NAME for entry in runnable) else []
-    parts, done = (1 + rounds) * len(jobs) + len(curve_lanes) + 1 + len(compared), 0
-
-    def tick(finished: int = 1) -> None:
-        nonlocal done
-        done += finished
-        if progress is not None:
-            progress(done, parts)
-
-    checked: list[tuple[Any, ...]] = []
+    compared = STUDIES if any(entry.name == CPP_NAME for entry in runnable) else ()
+    tick = make_stage_counter((1 + rounds) * len(jobs) + len(curve_lanes) + 1 + len(compared), progress)
     runners: list[Runner] = []
+    untimed_rows: list[Callable[..., BenchRow]] = []
     failures: list[str] = []
     wrong_names: set[str] = set()
     reference = cache(_reference_metrics)
     for precision in PRECISIONS:
-        with _enable_precision(precision):
-            Workload(1, steps, precision).inputs()
+        Workload(1, steps, precision).inputs()
     for entry, precision in jobs:
         workload = Workload(entry.lanes // (8 if quick else 1), steps, precision)
-        with _enable_precision(precision):
-            start_time = time.perf_counter()
-            runner = entry.make(workload)
-            metrics = runner()
-            first_seconds = time.perf_counter() - start_time
+        start_time = time.perf_counter()
+        runner = entry.prepare(workload)
+        metrics = runner()
+        first_seconds = time.perf_counter() - start_time
         try:
             deviation = _check_entry(entry, precision, metrics, reference(workload.lanes, steps))
         except NoResult as error:
             failures.append(str(error))
             wrong_names.add(entry.name)
-            tick(1 + rounds)
+            for _ in range(1 + rounds):
+                tick()
             continue
         runners.append(runner)
-        checked.append((entry.name, precision, workload.lanes, steps, first_seconds, deviation))
+        untimed_rows.append(partial(BenchRow, entry.name, precision, workload.lanes, steps, first_seconds, deviation))
         tick()
-    if not checked:
+    if not runners:
         raise NoResult(failures[0])
-    seconds: list[list[float]] = [[] for _ in checked]
-    for _ in range(rounds):
-        for (_, precision, *_), runner, durations in zip(checked, runners, seconds, strict=True):
-            with _enable_precision(precision):
-                durations.append(_time_call(runner))
-            tick()
+    seconds = _time_in_turns(runners, rounds, after_each=tick)
     del runners, runner
-    rows = [BenchRow(*columns, seconds=durations) for columns, durations in zip(checked, seconds, strict=True)]
+    rows = [make_row(durations) for make_row, durations in zip(untimed_rows, seconds, strict=True)]
     right_entries = [entry for entry in runnable if entry.name not in wrong_names]
     curve = []
     for lanes in curve_lanes:
@@ -217,14 +216,19 @@ def _is_timed(entry: Entry, precision: str, quick: bool) -> bool:
     return not quick or precision == "float32" or entry.name.startswith(("c++", "jaxbl fused"))
 
 
-def _time_call(runner: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    runner()
-    return time.perf_counter() - start
-
-
-def _enable_precision(precision: str) -> Any:
-    return jax.enable_x64(precision == "float64")
+def _time_in_turns(
+    runners: Sequence[Callable[[], Any]], rounds: int, in_a_row: int = 1, after_each: Callable[[], None] = lambda: None
+) -> list[list[float]]:
+    """Seconds of each runner's calls: in each round so many in a row, then `after_each`."""
+    seconds: list[list[float]] = [[] for _ in runners]
+    for _ in range(rounds):
+        for runner, durations in zip(runners, seconds, strict=True):
+            for _ in range(in_a_row):
+                start = time.perf_counter()
+                runner()
+                durations.append(time.perf_counter() - start)
+            after_each()
+    return seconds
 
 
 def _select_runnable(entries: Sequence[Entry], folder: Path) -> tuple[list[Entry], dict[str, str]]:
@@ -246,8 +250,7 @@ def _spread_lanes(lanes: int) -> np.ndarray:
 
 def _reference_metrics(lanes: int, steps: int) -> Metrics:
     """Figures of some of so many lanes by the plainest entry, in float64."""
-    with _enable_precision("float64"):
-        return NumpyChain(Workload(lanes, steps, "float64"), lanes=_spread_lanes(lanes))()
+    return NumpyChain(Workload(lanes, steps, "float64"), lanes=_spread_lanes(lanes))()
 
 
 def _check_entry(entry: Entry, precision: str, metrics: Metrics, reference: Metrics) -> float:
@@ -257,21 +260,17 @@ def _check_entry(entry: Entry, precision: str, metrics: Metrics, reference: Metr
 
 def _measure_curve(entries: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[JsonObject]:
     points = []
+    curve_entries = [
+        e for e in entries if e.name in (CPP_NAME, FUSED_NAME, SCAN_NAME) and (e.name != SCAN_NAME or lanes <= 2**17)
+    ]
+    # short ones are repeated, and several times in a row: threads that wait for more work disturb the next entry
+    repeats = round(1e8 / lanes / steps)
     for precision in precisions:
-        curve_entries = [
-            e for e in entries if e.name in (CPP_NAME, FUSED_NAME, SCAN_NAME) and (e.name != SCAN_NAME or lanes <= 2**17)
-        ]
-        with _enable_precision(precision):
-            runners = [entry.make(Workload(lanes, steps, precision)) for entry in curve_entries]
-            best = [float("inf")] * len(curve_entries)
-            # short ones are repeated, and several times in a row: threads that wait for more work disturb the next entry
-            repeats = round(1e8 / lanes / steps)
-            for _ in range(max(5, min(15, repeats))):
-                for i, runner in enumerate(runners):
-                    best[i] = min(best[i], *(_time_call(runner) for _ in range(max(1, min(4, repeats)))))
-        for entry, seconds in zip(curve_entries, best, strict=True):
+        runners = [entry.prepare(Workload(lanes, steps, precision)) for entry in curve_entries]
+        seconds = _time_in_turns(runners, max(5, min(15, repeats)), max(1, min(4, repeats)))
+        for entry, durations in zip(curve_entries, seconds, strict=True):
             point = {"name": entry.name, "precision": precision, "lanes": lanes, "steps": steps}
-            points.append(point | {"lane_steps_per_second": lanes * steps / seconds})
+            points.append(point | {"lane_steps_per_second": lanes * steps / min(durations)})
     return points
 
 
@@ -279,20 +278,21 @@ def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -
     """A small study from nothing: what was compiled before is forgotten."""
     rows = []
     workload = Workload(lanes, 3000, "float32")
-    with _enable_precision(workload.precision), TemporaryDirectory() as folder:
-        workload.inputs()
+    workload.inputs()
+    with TemporaryDirectory() as folder:
         for entry in make_entries(Path(folder), threads, devices):
             if (
                 entry.name not in names
                 or entry.lanes <= lanes
-                or entry.name in ("c++, one core", "jaxbl fused, one core", "jaxbl scan, one device")
+                or entry.name.endswith(("one core", "jaxbl scan, one device"))
             ):
                 continue
             jax.clear_caches()
             compile_block_loop.cache_clear()
             compile_library.cache_clear()
+            ((seconds,),) = _time_in_turns([lambda entry=entry: entry.prepare(workload)()], 1)
             row = {"name": entry.name, "precision": workload.precision, "lanes": lanes, "steps": workload.steps}
-            rows.append(row | {"seconds": _time_call(lambda entry=entry: entry.make(workload)())})
+            rows.append(row | {"seconds": seconds})
     return rows
 
 
@@ -318,12 +318,10 @@ def compare_study(name: str, folder: Path, threads: int, steps: int, rounds: int
     full_study = prepare_study(name, steps, lanes)
     runners = [FusedStudy(full_study), *(CppStudy(full_study, threads, folder, vectors) for vectors in _VECTOR_COUNTS)]
     check_medians(name, *(runner() for runner in runners[:2]))
-    best = [float("inf")] * len(runners)
-    for _ in range(rounds):
-        for i, runner in enumerate(runners):
-            best[i] = min(best[i], _time_call(runner))
+    best = [*map(min, _time_in_turns(runners, rounds))]
     row = {"name": name, "lanes": full_study.lanes, "seeds": full_study.seeds, "steps": steps, "deviation": deviation}
-    return row | {"jaxbl": full_study.lane_steps / best[0], "c++": full_study.lane_steps / min(best[1:])}
+    lane_steps = full_study.lanes * full_study.seeds * steps
+    return row | {"jaxbl": lane_steps / best[0], "c++": lane_steps / min(best[1:])}
 
 
 _SHORT_STEPS = 400
@@ -355,8 +353,7 @@ def check_run_metrics(name: str, metrics: Metrics, reference: Metrics, tolerance
     largest = 0.0
     for metric, column in reference.items():
         values, expected = np.asarray(metrics[metric], float), np.asarray(column, float)
-        both_nan = np.isnan(values) & np.isnan(expected)
-        only_one_nan = np.isnan(values) ^ np.isnan(expected)
+        only_one_nan = np.isnan(values) != np.isnan(expected)
         nan_share = float(np.mean(only_one_nan))
         if nan_share > _NAN_SHARE:
             raise NoResult(
@@ -364,7 +361,7 @@ def check_run_metrics(name: str, metrics: Metrics, reference: Metrics, tolerance
                 f"more than {_NAN_SHARE:g}; wrong results are not timed"
             )
         deviations = np.abs(values - expected) / np.maximum(np.abs(expected), np.finfo(float).tiny)
-        median = float(np.median(np.where(both_nan, 0.0, deviations)[~only_one_nan]))
+        median = float(np.median(np.where(np.isnan(expected), 0.0, deviations)[~only_one_nan]))
         if not median <= _TOLERANCE[tolerance].get(metric.partition(".")[2], 1e-8):
             raise NoResult(f"{name}: {metric} is off by {median:.2g} of it; wrong results are not timed")
         largest = max(largest, median)

@@ -135,10 +135,11 @@ class Workload(NamedTuple):
 @cache
 def _make_inputs(steps: int, precision: str) -> tuple[np.ndarray, np.ndarray]:
     work = Workload(1, steps, precision)
-    experiment = work.experiment()
-    indices = jnp.arange(steps, dtype=jnp.int32)
-    noise = jax.jit(lambda: unit_noise(jnp.asarray(SEED), indices, SIDES))()
-    torque = jax.vmap(experiment.excitation)(indices.astype(work.dtype) * experiment.run.sample_period)
+    with jax.enable_x64(precision == "float64"):
+        experiment = work.experiment()
+        indices = jnp.arange(steps, dtype=jnp.int32)
+        noise = jax.jit(lambda: unit_noise(jnp.asarray(SEED), indices, SIDES))()
+        torque = jax.vmap(experiment.excitation)(indices.astype(work.dtype) * experiment.run.sample_period)
     return np.asarray(torque, work.dtype), np.stack([np.asarray(noise[side], work.dtype) for side in SIDES], 1)
 
 
@@ -147,14 +148,9 @@ class ChunkedProgram:
 
     def __init__(self, function: Callable[..., Any], workload: Workload, size: int, *shared_arguments: Any):
         self._lanes, self._shared_arguments = workload.lanes, shared_arguments
-        padded_lanes = -(-workload.lanes // size) * size
-        padded = {
-            path: np.pad(column, (0, padded_lanes - len(column)), "edge") for path, column in workload.values().items()
-        }
-        self._chunks = [
-            {path: jnp.asarray(column[start : start + size]) for path, column in padded.items()}
-            for start in range(0, padded_lanes, size)
-        ]
+        shape = -(-workload.lanes // size), size
+        columns = {path: jnp.asarray(np.resize(column, shape)) for path, column in workload.values().items()}
+        self._chunks = [{path: column[i] for path, column in columns.items()} for i in range(shape[0])]
         self.compiled = jax.jit(function).lower(self._chunks[0], *shared_arguments).compile()
 
     def __call__(self) -> Metrics:

@@ -5,7 +5,6 @@ import importlib.util
 import json
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -63,8 +62,7 @@ def test_figures_are_those_of_the_reference(name, precision, folder):
     if name in left_out:
         pytest.skip(left_out[name])
     entry = next(entry for entry in runnable if entry.name == name)
-    with jax.enable_x64(precision == "float64"):
-        figures = entry.make(Workload(min(entry.lanes, 70), STEPS, precision))()
+    figures = entry.prepare(Workload(min(entry.lanes, 70), STEPS, precision))()
     assert set(figures) == set(METRIC_NAMES)
     assert all(len(values) == min(entry.lanes, 70) for values in figures.values())
     # which raises where they are not

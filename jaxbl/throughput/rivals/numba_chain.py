@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from ..workload import Metrics, Workload, metrics_from_sums
-from .numpy_chain import constants_as
+from .numpy_chain import step_constants
 
 BLOCK_LANES = 64
 """Lanes of a block: several registers of the widest vectors, and a state that stays in the first cache."""
@@ -25,7 +25,7 @@ class NumbaChain:
         self._inputs = [np.ascontiguousarray(column) for column in (torque, *noise.T)]
         padded = -(-workload.lanes // BLOCK_LANES) * BLOCK_LANES
         self._values = np.stack([np.resize(column, padded) for column in workload.values().values()])
-        self._constants = constants_as(workload.dtype.type)
+        self._constants = step_constants(workload.dtype.type)
 
     def __call__(self) -> Metrics:
         import numba
@@ -48,68 +48,56 @@ def compile_block_loop(precision: str) -> Callable[..., np.ndarray]:
     def run(steps, start, window, torque, motor_noise, load_noise, c, values):  # pragma: no cover
         lanes = values.shape[1]
         out = np.zeros((9, lanes))
-        h, motor_inertia, motor_viscous, load_inertia, load_viscous, ratio = c[:6]
-        stiffness, slope, share, miss, zero, half, four = c[6:]
-        unity, bow = half + half, half * slope
-        motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
-        load_mass, load_drag = load_inertia / h, half * load_viscous
-        half = half * h
-        motor_keep, motor_gain = (motor_mass - motor_drag) / (motor_mass + motor_drag), unity / (motor_mass + motor_drag)
-        load_keep, load_gain = (load_mass - load_drag) / (load_mass + load_drag), unity / (load_mass + load_drag)
-        motor_inverse, load_friction, load_share = unity / motor_inertia, load_viscous / load_inertia, load_inertia / ratio
+        h, half, ratio, stiffness, bow, motor_keep, motor_gain, load_keep, load_gain = c[:9]
+        motor_viscous, motor_inverse, load_friction, miss, share, motor_inertia, load_share, zero, unity, four = c[9:]
         for block in prange(lanes // n):
             # one buffer: of its parts the compiler knows that they do not overlap
-            s = np.zeros(27 * n, values.dtype)
-            for k in range(6):
-                for j in range(n):
-                    s[k * n + j] = values[k, block * n + j]
-            for j in range(n):
-                s[13 * n + j] = -miss
+            s = np.zeros((27, n), values.dtype)
+            block_lanes = slice(block * n, (block + 1) * n)
+            s[:6], s[13] = values[:, block_lanes], -miss
             for i in range(steps):
                 u, motor_unit, load_unit = torque[i], motor_noise[i], load_noise[i] / ratio
                 counts, inside = (unity if i >= start else zero), (unity if i >= window else zero)
                 for j in range(n):
-                    motor, motor_rate, load, load_rate = s[6 * n + j], s[7 * n + j], s[8 * n + j], s[9 * n + j]
-                    motor_guess, load_guess = s[13 * n + j], s[14 * n + j]
-                    motor_read, load_read = motor + s[5 * n + j] * motor_unit, load + s[5 * n + j] * load_unit
+                    motor, motor_rate, load, load_rate = s[6, j], s[7, j], s[8, j], s[9, j]
+                    motor_guess, load_guess = s[13, j], s[14, j]
+                    motor_read, load_read = motor + s[5, j] * motor_unit, load + s[5, j] * load_unit
                     motor_off, load_off = motor_rate - motor_guess, load_rate - load_guess
-                    s[25 * n + j] += inside * motor_off * motor_off
-                    s[26 * n + j] += inside * load_off * load_off
+                    s[25, j] += inside * motor_off * motor_off
+                    s[26, j] += inside * load_off * load_off
                     motor, load = motor + half * motor_rate, load + half * load_rate
                     z = motor - ratio * load
-                    through = stiffness * (z - four * s[4 * n + j] * tanh(bow * z))
+                    through = stiffness * (z - four * s[4, j] * tanh(bow * z))
                     motor_rate = motor_keep * motor_rate + motor_gain * (u - through)
                     load_rate = load_keep * load_rate + load_gain * (ratio * through)
-                    s[6 * n + j], s[7 * n + j] = motor + half * motor_rate, motor_rate
-                    s[8 * n + j], s[9 * n + j] = load + half * load_rate, load_rate
-                    motor_miss, load_miss = motor_read - s[11 * n + j], load_read - s[12 * n + j]
+                    s[6, j], s[7, j] = motor + half * motor_rate, motor_rate
+                    s[8, j], s[9, j] = load + half * load_rate, load_rate
+                    motor_miss, load_miss = motor_read - s[11, j], load_read - s[12, j]
                     motor_sign = (unity if motor_miss > zero else zero) - (unity if motor_miss < zero else zero)
                     load_sign = (unity if load_miss > zero else zero) - (unity if load_miss < zero else zero)
-                    motor_now, load_now = s[j] * motor_sign, s[2 * n + j] * load_sign
-                    s[11 * n + j] += h * (motor_guess + s[n + j] * motor_sign * np.sqrt(abs(motor_miss)))
-                    s[12 * n + j] += h * (load_guess + s[3 * n + j] * load_sign * np.sqrt(abs(load_miss)))
-                    s[13 * n + j] = motor_guess + h * ((u - motor_viscous * motor_guess) * motor_inverse + motor_now)
-                    s[14 * n + j] = load_guess + h * (load_now - load_friction * load_guess)
-                    s[15 * n + j] += share * (motor_now - s[15 * n + j])
-                    s[16 * n + j] += share * (load_now - s[16 * n + j])
-                    motor_torque, load_torque = -motor_inertia * s[15 * n + j], load_share * s[16 * n + j]
-                    twist, bend = s[17 * n + j], s[10 * n + j]
+                    motor_now, load_now = s[0, j] * motor_sign, s[2, j] * load_sign
+                    s[11, j] += h * (motor_guess + s[1, j] * motor_sign * np.sqrt(abs(motor_miss)))
+                    s[12, j] += h * (load_guess + s[3, j] * load_sign * np.sqrt(abs(load_miss)))
+                    s[13, j] = motor_guess + h * ((u - motor_viscous * motor_guess) * motor_inverse + motor_now)
+                    s[14, j] = load_guess + h * (load_now - load_friction * load_guess)
+                    s[15, j] += share * (motor_now - s[15, j])
+                    s[16, j] += share * (load_now - s[16, j])
+                    motor_torque, load_torque = -motor_inertia * s[15, j], load_share * s[16, j]
+                    twist, bend = s[17, j], s[10, j]
                     first, second = counts * twist, counts * bend
-                    s[18 * n + j] += first * twist
-                    s[19 * n + j] += first * bend
-                    s[20 * n + j] += second * bend
-                    s[21 * n + j] += first * motor_torque
-                    s[22 * n + j] += second * motor_torque
-                    s[23 * n + j] += first * load_torque
-                    s[24 * n + j] += second * load_torque
+                    s[18, j] += first * twist
+                    s[19, j] += first * bend
+                    s[20, j] += second * bend
+                    s[21, j] += first * motor_torque
+                    s[22, j] += second * motor_torque
+                    s[23, j] += first * load_torque
+                    s[24, j] += second * load_torque
                     z = motor_read - ratio * load_read
-                    s[17 * n + j] = twist + share * (z - twist)
-                    s[10 * n + j] = bend - share * (four * tanh(bow * z) + bend)
+                    s[17, j] = twist + share * (z - twist)
+                    s[10, j] = bend - share * (four * tanh(bow * z) + bend)
                 if i % 512 == 511 or i == steps - 1:
-                    for k in range(9):
-                        for j in range(n):
-                            out[k, block * n + j] += s[(18 + k) * n + j]
-                            s[(18 + k) * n + j] = zero
+                    out[:, block_lanes] += s[18:]
+                    s[18:] = zero
         return out
 
     return run

@@ -8,9 +8,20 @@ import numpy as np
 from ..workload import Metrics, Workload, chain_constants, metrics_from_sums
 
 
-def constants_as(kind: Callable[[float], Any]) -> tuple[Any, ...]:
-    """The chain's constants as `kind`, and 0, 1/2 and 4: a literal would make float64 of float32."""
-    return tuple(kind(value) for value in (*chain_constants().values(), 0.0, 0.5, 4.0))
+def step_constants(kind: Callable[[float], Any]) -> tuple[Any, ...]:
+    """The constants of a step, and 0, 1 and 4, in the order in which loops unpack them.
+
+    They are made `kind`: a literal would make float64 of float32.
+    """
+    chain = list(chain_constants().values())
+    h, motor_inertia, motor_viscous, load_inertia, load_viscous, ratio = chain[:6]
+    stiffness, slope, share, velocity_error = chain[6:]
+    motor_mass, motor_drag, load_mass, load_drag = motor_inertia / h, motor_viscous / 2, load_inertia / h, load_viscous / 2
+    motor_gain, load_gain = 1.0 / (motor_mass + motor_drag), 1.0 / (load_mass + load_drag)
+    motor_keep, load_keep = motor_gain * (motor_mass - motor_drag), load_gain * (load_mass - load_drag)
+    of_plant = h / 2, ratio, stiffness, slope / 2, motor_keep, motor_gain, load_keep, load_gain
+    of_observers = motor_viscous, 1.0 / motor_inertia, load_viscous / load_inertia, velocity_error
+    return tuple(map(kind, (h, *of_plant, *of_observers, share, motor_inertia, load_inertia / ratio, 0.0, 1.0, 4.0)))
 
 
 class NumpyChain:
@@ -23,21 +34,17 @@ class NumpyChain:
         self._values = [column[lanes] for column in workload.values().values()]
 
     def __call__(self) -> Metrics:
-        constants = constants_as(self._workload.dtype.type)
+        constants = step_constants(self._workload.dtype.type)
         return metrics_from_sums(self._workload, _run_chain(self._workload, self._inputs, constants, self._values))
 
 
-def _run_chain(workload: Workload, inputs: Any, c: Any, values: Any) -> list[np.ndarray]:
+def _run_chain(workload: Workload, inputs: Any, constants: Any, values: Any) -> list[np.ndarray]:
     """From inputs, constants and the lanes' values to their nine sums."""
     torque, motor_noise, load_noise = inputs
     motor_alpha, motor_lambda, load_alpha, load_lambda, dead_zone, noise = values
-    h, motor_inertia, motor_viscous, load_inertia, load_viscous, ratio = c[:6]
-    stiffness, slope, share, miss, zero, half, four = c[6:]
-    gap, load_noise_level, bow, load_share = four * dead_zone, noise / ratio, half * slope, load_inertia / ratio
-    motor_mass, motor_drag = motor_inertia / h, half * motor_viscous
-    load_mass, load_drag = load_inertia / h, half * load_viscous
-    kicks = motor_mass - motor_drag, motor_mass + motor_drag, load_mass - load_drag, load_mass + load_drag
-    of_plant = half * h, ratio, stiffness, bow, *kicks
+    h, half, ratio, stiffness, bow, motor_keep, motor_gain, load_keep, load_gain = constants[:9]
+    motor_viscous, motor_inverse, load_friction, miss, share, motor_inertia, load_share, zero, _, four = constants[9:]
+    gap, load_noise_level = four * dead_zone, noise / ratio
     motor = motor_rate = load = load_rate = motor_seen = load_seen = load_guess = zero * noise
     motor_control = load_control = twist = bend = motor
     motor_guess = motor - miss
@@ -49,11 +56,17 @@ def _run_chain(workload: Workload, inputs: Any, c: Any, values: Any) -> list[np.
             motor_off, load_off = motor_rate - motor_guess, load_rate - load_guess
             sums[7] += motor_off * motor_off
             sums[8] += load_off * load_off
-        motor, motor_rate, load, load_rate = _move(motor, motor_rate, load, load_rate, u, gap, of_plant)
-        nominal = (u - motor_viscous * motor_guess) / motor_inertia
+        # plant: drift, kick, drift
+        motor, load = motor + half * motor_rate, load + half * load_rate
+        z = motor - ratio * load
+        through = stiffness * (z - gap * np.tanh(bow * z))
+        motor_rate = motor_keep * motor_rate + motor_gain * (u - through)
+        load_rate = load_keep * load_rate + load_gain * (ratio * through)
+        motor, load = motor + half * motor_rate, load + half * load_rate
+        nominal = (u - motor_viscous * motor_guess) * motor_inverse
         motor_seen, motor_guess, now = _observe(motor_seen, motor_guess, motor_read, nominal, motor_alpha, motor_lambda, h)
         motor_control = motor_control + share * (now - motor_control)
-        nominal = -load_viscous * load_guess / load_inertia
+        nominal = -load_friction * load_guess
         load_seen, load_guess, now = _observe(load_seen, load_guess, load_read, nominal, load_alpha, load_lambda, h)
         load_control = load_control + share * (now - load_control)
         if i >= workload.start:
@@ -69,17 +82,6 @@ def _run_chain(workload: Workload, inputs: Any, c: Any, values: Any) -> list[np.
         twist = twist + share * (z - twist)
         bend = bend - share * (four * np.tanh(bow * z) + bend)
     return sums
-
-
-def _move(motor, motor_rate, load, load_rate, torque, gap, of_plant):
-    """One step of the plant: drift, kick, drift."""
-    half, ratio, stiffness, bow, motor_less, motor_more, load_less, load_more = of_plant
-    motor, load = motor + half * motor_rate, load + half * load_rate
-    z = motor - ratio * load
-    through = stiffness * (z - gap * np.tanh(bow * z))
-    motor_rate = (motor_less * motor_rate + torque - through) / motor_more
-    load_rate = (load_less * load_rate + ratio * through) / load_more
-    return motor + half * motor_rate, motor_rate, load + half * load_rate, load_rate
 
 
 def _observe(position, velocity, reading, nominal, alpha, lambda_, h):
