@@ -11,6 +11,7 @@ At the finest level the second rule traces each piece of the boundary from end t
 has the size of the fine grid: vertices and cells are sorted arrays of flat indices.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -74,28 +75,17 @@ class CellGrid:
         """Flat indices of vertices of the coarse grid by their positions in it."""
         return np.stack(np.unravel_index(np.asarray(positions, np.int64), self.coarse_sizes), axis=-1) @ self._strides
 
-    def coarse_vertices(self) -> Indices:
-        """All vertices of the coarse grid."""
-        return self._lattice(self.coarse_sizes)
-
     def coarse_cells(self) -> Indices:
         """All cells of level 0."""
-        return self._lattice(self._coarse_cell_counts)
+        counts = zip(self._coarse_cell_counts, self._strides, strict=True)
+        return _all_sums(stride * np.arange(count) for count, stride in counts)
 
-    def _lattice(self, counts: Sequence[int]) -> Indices:
-        """The first vertices of the coarse grid along each axis, so many as `counts` says."""
-        return _all_sums(stride * np.arange(count) for count, stride in zip(counts, self._strides, strict=True))
+    def shift_cells(self, cells: Indices, level: int, shifts: tuple[int, ...], along: int | None = None) -> Indices:
+        """Cells moved by all combinations of shifts along the refined axes but `along`, in units of cells of `level`.
 
-    def children(self, cells: Indices, level: int) -> Indices:
-        """The cells of `level` into which cells of the level before are halved."""
-        return self._shift_cells(cells, level, (0, 1))
-
-    def child_vertices(self, cells: Indices, level: int) -> Indices:
-        """The corners of the :meth:`children` of cells."""
-        return self._shift_cells(cells, level, (0, 1, 2))
-
-    def _shift_cells(self, cells: Indices, level: int, shifts: tuple[int, ...], along: int | None = None) -> Indices:
-        """Cells moved by all combinations of shifts along the refined axes but `along`, in units of cells of `level`."""
+        By (0, 1), cells of the level before become the cells of `level` into which they are halved; by (0, 1, 2), the
+        corners of these.
+        """
         offsets = _all_sums(step * np.array(shifts) for axis, step in enumerate(self._steps) if axis != along)
         return np.unique(cells[:, None] + (offsets << self.depth - level))
 
@@ -110,7 +100,7 @@ class CellGrid:
         """Yield the edges of cells of `level`, axis by axis: the axis, lower ends, upper ends."""
         stride = 1 << self.depth - level
         for axis, step in enumerate(self._steps):
-            starts = self._shift_cells(cells, level, (0, 1), axis)
+            starts = self.shift_cells(cells, level, (0, 1), axis)
             yield axis, starts, starts + stride * step
 
     def cells_around(self, axis: int, starts: Indices, level: int) -> Indices:
@@ -146,7 +136,7 @@ def refine_boundary(
     Returns:
         The vertices that were evaluated, sorted, and their values.
     """
-    vertices = grid.coarse_vertices()
+    vertices = grid.coarse_indices(np.arange(math.prod(grid.coarse_sizes)))
     values = evaluate(vertices)
 
     def values_of(indices: Indices) -> np.ndarray:
@@ -173,12 +163,12 @@ def refine_boundary(
                 needed = to_halve[level - 1] = np.setdiff1d(due, halved[level - 1], assume_unique=True)
             if not any(len(cells) for cells in to_halve):
                 break
-            batch = np.unique(np.concatenate([grid.child_vertices(cells, i + 1) for i, cells in enumerate(to_halve)]))
+            batch = np.unique(np.concatenate([grid.shift_cells(cells, i, (0, 1, 2)) for i, cells in enumerate(to_halve, 1)]))
             batch = np.setdiff1d(batch, vertices, assume_unique=True)
             if len(batch):
                 batch_values, positions = evaluate(batch), np.searchsorted(vertices, batch)
                 vertices, values = np.insert(vertices, positions, batch), np.insert(values, positions, batch_values, axis=0)
             for level, cells in enumerate(to_halve, 1):
                 halved[level - 1] = np.union1d(halved[level - 1], cells)
-                hot[level] = np.union1d(hot[level], cells_around_hot_edges(grid.children(cells, level), level))
+                hot[level] = np.union1d(hot[level], cells_around_hot_edges(grid.shift_cells(cells, level, (0, 1)), level))
     return vertices, values
