@@ -163,9 +163,8 @@ class Comparison:
         points that differ by more than noise, or by more than rounding if the noise is not known.
         """
         matched = _MatchedMetric(metric, *self._studies, self.paired)
-        axis_values = self._studies[0].axis_values.reset_index(drop=True)
         first, second = matched.means
-        return axis_values.assign(first=first, second=second, differs=matched.differs)
+        return matched.axis_values.reset_index(drop=True).assign(first=first, second=second, differs=matched.differs)
 
 
 def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -> Comparison:
@@ -186,7 +185,7 @@ def compare(first: str | Path | StudyResult, second: str | Path | StudyResult) -
     paths = list(dict.fromkeys(axis.path for study in studies for axis in study.config.axes))
     matched, point_counts, seed_count, paired = _match_points(studies, paths)
     columns = [name for name in studies[0].columns if name in studies[1].columns and name not in (*paths, "seed")]
-    changes = [_compare_metric(metric, *matched, paired) for metric in columns] if point_counts[0] else []
+    changes = [_MatchedMetric(metric, *matched, paired).change() for metric in columns] if point_counts[0] else []
     # metrics without a change come last, in the order of the columns
     changes.sort(key=lambda change: -change.size)
     unfinished = {
@@ -295,7 +294,7 @@ def _match_points(
     matched = []
     for study, frame, code, study_seeds in zip(studies, frames, codes, seeds, strict=True):
         runs = frame.assign(point=code, row=np.arange(len(frame)))
-        rows = runs.drop_duplicates(["point", "seed"], keep="last").pivot(index="point", columns="seed", values="row")
+        rows = runs.groupby(["point", "seed"])["row"].last().unstack()
         row_index = rows.reindex(index=common_points, columns=common_seeds if paired else study_seeds).fillna(-1)
         axis_values = runs.drop_duplicates("point", keep="last").set_index("point").loc[common_points, paths]
         matched.append(_MatchedStudy(study, len(frame), row_index.to_numpy(int), axis_values))
@@ -324,6 +323,10 @@ class _MatchedMetric:
     """A metric of two studies at their common points.
 
     Attributes:
+        metric: column.
+        boolean: True if its values are true or false.
+        paired: True if runs are compared seed by seed.
+        axis_values: values of all axes, a row for each point.
         first, second: the metric, `(points, seeds)`; if paired, NaN unless both studies have a number.
         only: number of runs with a number in the first study alone, and in the second alone.
         means: mean over the seeds with a number, `(points,)` for each study.
@@ -333,6 +336,7 @@ class _MatchedMetric:
     """
 
     def __init__(self, metric: str, first: _MatchedStudy, second: _MatchedStudy, paired: bool):
+        self.metric, self.boolean, self.paired, self.axis_values = metric, is_boolean(metric), paired, first.axis_values
         a, b = first.read_metric(metric), second.read_metric(metric)
         self.only: Any = (0, 0)
         if paired:
@@ -343,7 +347,7 @@ class _MatchedMetric:
         self.first, self.second = a, b
         self.means = _row_means(a), _row_means(b)
         difference = self.means[1] - self.means[0]
-        if is_boolean(metric):
+        if self.boolean:
             self.knows_noise = False
             self.changed = (self.means[0] >= 0.5) != (self.means[1] >= 0.5)
             self.changed &= np.isfinite(difference)
@@ -360,6 +364,44 @@ class _MatchedMetric:
         sizes = np.maximum(*(np.abs(mean) for mean in self.means))
         median = np.nanmedian(sizes) if np.isfinite(sizes).any() else 0.0
         return ROUNDING[precision] * sizes + np.finfo(precision).eps * median
+
+    def change(self) -> MetricChange:
+        """The change from the first study to the second."""
+        a, b = self.means
+        with _ignore_undefined():
+            change = b - a if self.boolean else np.log(b / a)
+        size = np.abs(np.where(np.isfinite(change), change, 0.0))
+        differs, compared, most = self.differs, int(np.isfinite(b - a).sum()), None
+        if differs.any():
+            # the factor is not defined between numbers of opposite sign: NaN counts as no change
+            i = int(np.argmax(np.where(differs, np.abs(np.where(np.isnan(change), 0.0, change)), -1.0)))
+            most = {**self.axis_values.iloc[i].to_dict(), "first": float(a[i]), "second": float(b[i])}
+        return MetricChange(
+            metric=self.metric,
+            better=find_metric(self.metric).better,
+            points=compared,
+            only=self.only,
+            changed=int(self.changed.sum()),
+            differs=int(differs.sum()) if self.knows_noise else None,
+            up=int((b > a)[differs].sum()),
+            size=float((size if self.boolean else np.where(differs, size, 0.0)).sum() / max(compared, 1)),
+            moved=self._mean_change(),
+            where=_partial_ranges(self.axis_values, differs),
+            most=most,
+        )
+
+    def _mean_change(self) -> MeanChange:
+        """Mean change over the points at which all seeds have a number; its interval by the spread over seeds."""
+        with _ignore_undefined():
+            a, b = (values if self.boolean else np.log(values) for values in (self.first, self.second))
+        complete = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        if not complete.any():
+            return MeanChange(math.nan, math.nan, math.nan)
+        a, b = a[complete].mean(axis=0), b[complete].mean(axis=0)
+        mean, variance, freedom = (float(statistic[0]) for statistic in _mean_differences(a[None], b[None], self.paired))
+        half = float(stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, freedom)) * math.sqrt(variance)
+        ends = mean, mean - half, mean + half
+        return MeanChange(*(float(end) if self.boolean else math.exp(end) for end in ends))
 
 
 def _row_means(values: np.ndarray) -> np.ndarray:
@@ -400,34 +442,6 @@ def _select_significant(p: np.ndarray) -> np.ndarray:
     return significant
 
 
-def _compare_metric(metric: str, first: _MatchedStudy, second: _MatchedStudy, paired: bool) -> MetricChange:
-    matched, boolean = _MatchedMetric(metric, first, second, paired), is_boolean(metric)
-    a, b = matched.means
-    with _ignore_undefined():
-        change = b - a if boolean else np.log(b / a)
-    size = np.abs(np.where(np.isfinite(change), change, 0.0))
-    differs = matched.differs
-    compared = int(np.isfinite(b - a).sum())
-    most = None
-    if differs.any():
-        # the factor is not defined between numbers of opposite sign: NaN counts as no change
-        i = int(np.argmax(np.where(differs, np.abs(np.where(np.isnan(change), 0.0, change)), -1.0)))
-        most = {**first.axis_values.iloc[i].to_dict(), "first": float(a[i]), "second": float(b[i])}
-    return MetricChange(
-        metric=metric,
-        better=find_metric(metric).better,
-        points=compared,
-        only=matched.only,
-        changed=int(matched.changed.sum()),
-        differs=int(differs.sum()) if matched.knows_noise else None,
-        up=int((b > a)[differs].sum()),
-        size=float((size if boolean else np.where(differs, size, 0.0)).sum() / max(compared, 1)),
-        moved=_mean_change(matched, boolean, paired),
-        where=_partial_ranges(first.axis_values, differs),
-        most=most,
-    )
-
-
 def _partial_ranges(axis_values: pd.DataFrame, selected: np.ndarray) -> dict[str, list[Any]]:
     """Ranges of the selected points along the axes of which they do not cover the full range."""
     if not selected.any():
@@ -441,17 +455,3 @@ def _value_range(column: pd.Series) -> list[Any]:
     if pd.api.types.is_numeric_dtype(column):
         return [float(column.min()), float(column.max())]
     return sorted(map(str, column.unique()))
-
-
-def _mean_change(matched: _MatchedMetric, boolean: bool, paired: bool) -> MeanChange:
-    """Mean change over the points at which all seeds have a number; its interval by the spread over seeds."""
-    with _ignore_undefined():
-        a, b = (values if boolean else np.log(values) for values in (matched.first, matched.second))
-    complete = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    if not complete.any():
-        return MeanChange(math.nan, math.nan, math.nan)
-    a, b = a[complete].mean(axis=0), b[complete].mean(axis=0)
-    mean, variance, freedom = (float(statistic[0]) for statistic in _mean_differences(a[None], b[None], paired))
-    half = float(stats.t.ppf(0.5 + 0.5 * _CONFIDENCE, freedom)) * math.sqrt(variance) if np.isfinite(variance) else math.nan
-    ends = mean, mean - half, mean + half
-    return MeanChange(*(float(end) if boolean else math.exp(end) for end in ends))
