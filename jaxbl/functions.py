@@ -283,7 +283,7 @@ def sweep_arrays(
         for start in range(0, count, points):
             indices = np.minimum(np.arange(start, start + points), count - 1)
             results, gains = program.run({path: column[indices] for path, column in lanes.items()}, seed_values)
-            results = add_gain_metrics(results, gains) if needs_gain_metrics(names) else results
+            results = add_gain_metrics(results, gains, names)
             parts.append({name: np.asarray(results[name])[:, : count - start] for name in columns})
     return Grid(
         {**axes, "seed": seed_values},

@@ -40,13 +40,13 @@ class Bundle(NamedTuple):
         folder: folder of the study.
         identity: identity of the study in its manifest.
         require_backend: refuse a study that the fused loop cannot run.
-        chunks: indices of the chunks; of a refined study, the chunks themselves.
+        chunks: the chunks.
     """
 
     folder: str
     identity: str
     require_backend: bool
-    chunks: tuple[int | Chunk, ...]
+    chunks: tuple[Chunk, ...]
 
 
 class ClusterRun(StudyRun):
@@ -72,14 +72,13 @@ class ClusterRun(StudyRun):
 
     def _compute_first(self, chunks: Iterable[Chunk], count: int) -> Iterator[Bundle]:
         """Have so many of the missing chunks computed, which shows how long a chunk takes, and bundle the other ones."""
-        # the points of all chunks would be 8 GB in a study of 10^9
-        missing = [chunk.index if self.engine.points.refinement is None else chunk for chunk in self.missing_chunks(chunks)]
-        first, following, before = missing[:count], missing[count:], self.totals.run_seconds
+        missing, before = list(self.missing_chunks(chunks)), self.totals.run_seconds
+        first, following = missing[:count], missing[count:]
         self._compute_bundles(self._make_bundles(first, 1))
         seconds, workers = (self.totals.run_seconds - before) / count, max(self._cluster.workers, 1)
         return self._make_bundles(following, _bundle_size(seconds, len(following), workers))
 
-    def _make_bundles(self, chunks: Sequence[int | Chunk], size: int) -> Iterator[Bundle]:
+    def _make_bundles(self, chunks: Sequence[Chunk], size: int) -> Iterator[Bundle]:
         """Make bundles of `size` chunks each."""
         study = str(self.store.folder.absolute()), self.store.manifest["identity"], self.engine.require_backend
         for first in range(0, len(chunks), size):
@@ -88,7 +87,7 @@ class ClusterRun(StudyRun):
     def _compute_bundles(self, bundles: Iterable[Bundle]) -> None:
         """Have workers compute bundles."""
         for _, bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, bundles, self._poll_parts):
-            for chunk in _chunks_of(self.engine, bundle):
+            for chunk in bundle.chunks:
                 _wait_for_part(self.store.part_path(chunk.index), host)
                 self.count_chunk(chunk)
             self.worker_totals += totals
@@ -107,11 +106,6 @@ def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
     by_time = int(_BUNDLE_SECONDS / max(seconds, 1e-3))
     by_worker = math.ceil(chunks / (workers * _BUNDLES_PER_WORKER))
     return max(min(by_time, by_worker), math.ceil(chunks / _MAX_BUNDLES), 1)
-
-
-def _chunks_of(engine: Engine, bundle: Bundle) -> list[Chunk]:
-    """The chunks of a bundle."""
-    return [engine.chunk(chunk) if isinstance(chunk, int) else chunk for chunk in bundle.chunks]
 
 
 def _wait_for_part(part: Path, host: str) -> None:
@@ -138,7 +132,7 @@ def compute_bundle(bundle: Bundle) -> tuple[RunTotals, str]:
         engine = _cached_engine(bundle.folder, bundle.identity, store.layout, store.backend, bundle.require_backend)
         engine.compile_seconds = engine.run_seconds = 0.0
         run = StudyRun(engine, store)
-        run.compute_missing(_chunks_of(engine, bundle))
+        run.compute_missing(bundle.chunks)
     return run.totals, host
 
 

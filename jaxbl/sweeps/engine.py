@@ -10,7 +10,6 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,8 +21,8 @@ from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
 from .costs import Operations, can_run_fused, count_operations, lanes_at_once, load_costs
-from .metrics import ObserverGains, add_gain_metrics, compile_gain_metrics, needs_gain_metrics
-from .points import Points
+from .metrics import add_gain_metrics, compile_gain_metrics
+from .points import PointIndices, Points
 from .programs import (
     BACKENDS,
     MAX_PROGRAMS,
@@ -45,13 +44,14 @@ class Chunk(NamedTuple):
         index: number of the chunk, and of the part that stores it.
         group: index of the points' group.
         seeds: noise seeds, at most as many as the layout has.
-        points: indices of points in the group, at most as many as the layout has.
+        points: indices of points in the group, at most as many as the layout has; a range where these follow one another,
+            since a study may have millions of chunks.
     """
 
     index: int
     group: int
-    seeds: np.ndarray
-    points: np.ndarray
+    seeds: range
+    points: PointIndices
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -153,7 +153,6 @@ class Engine:
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
         self._programs = RecentResults()
-        self._needs_gain_metrics = needs_gain_metrics(config.sweep.requested_metrics)
 
     def _choose_backend(self) -> Backend:
         """The faster backend; it must not depend on the chunk size that is set, since backends round differently."""
@@ -198,7 +197,12 @@ class Engine:
 
     def __len__(self) -> int:
         """Number of chunks; of a refined study, those of its coarse grid."""
-        return len(self.points.groups) * self.count_chunks(self.points.coarse_size)
+        return math.prod(self._slice_counts)
+
+    @property
+    def _slice_counts(self) -> tuple[int, int, int]:
+        """Numbers of groups, of slices of the seeds, and of slices of a group's points, or of its coarse grid."""
+        return len(self.points.groups), self._seed_slices, math.ceil(self.points.coarse_size / self.layout.points)
 
     def count_chunks(self, points: int, layout: Layout | None = None) -> int:
         """Number of chunks for a number of points of a group, with all seeds; `layout` is the engine's if left out."""
@@ -207,12 +211,10 @@ class Engine:
 
     def chunk(self, index: int) -> Chunk:
         """The chunk with an index; of a refined study, one of its coarse grid."""
-        slice_count = math.ceil(self.points.coarse_size / self.layout.points)
-        group, index_in_group = divmod(index, self._seed_slices * slice_count)
-        seed_slice, point_slice = divmod(index_in_group, slice_count)
+        group, seed_slice, point_slice = map(int, np.unravel_index(index, self._slice_counts))
         first = point_slice * self.layout.points
-        last = min(first + self.layout.points, self.points.coarse_size)
-        return Chunk(index, group, self._seed_slice(seed_slice), self.points.coarse_points(np.arange(first, last)))
+        positions = range(self.points.coarse_size)[first : first + self.layout.points]
+        return Chunk(index, group, self._seed_slice(seed_slice), self.points.coarse_points(positions))
 
     def chunk_order(self) -> list[int]:
         """Indices of all chunks in the order in which they are computed, so that the grid is covered coarsely first.
@@ -220,11 +222,9 @@ class Engine:
         The first seeds come first, slices of points by their rank (:func:`_rank_coarse_first`); then the next seeds. Groups
         take turns if the programs of all groups can be held in memory.
         """
-        slice_count = math.ceil(self.points.coarse_size / self.layout.points)
-        shape = len(self.points.groups), self._seed_slices, slice_count
-        check_cost("the list of chunks", _CHUNK_BYTES * math.prod(shape), "[sweep] chunk should be larger, or left out")
-        group, seed_slice, point_slice = np.unravel_index(np.arange(math.prod(shape)), shape)
-        rank, level = _rank_coarse_first(slice_count)
+        check_cost("the list of chunks", _CHUNK_BYTES * len(self), "[sweep] chunk should be larger, or left out")
+        group, seed_slice, point_slice = np.unravel_index(np.arange(len(self)), self._slice_counts)
+        rank, level = _rank_coarse_first(self._slice_counts[2])
         if len(self.points.groups) <= MAX_PROGRAMS:
             keys = seed_slice, level[point_slice], group, rank[point_slice]
         else:
@@ -252,10 +252,10 @@ class Engine:
         """Number of slices of the seeds, each for one chunk."""
         return math.ceil(self.config.sweep.seeds / self.layout.seeds)
 
-    def _seed_slice(self, index: int) -> np.ndarray:
-        """Return the seeds of a slice; all of them may be more than memory holds."""
-        first, end = index * self.layout.seeds, min((index + 1) * self.layout.seeds, self.config.sweep.seeds)
-        return self.config.sweep.first_seed + np.arange(first, end)
+    def _seed_slice(self, index: int) -> range:
+        """Return the seeds of a slice."""
+        sweep, first = self.config.sweep, index * self.layout.seeds
+        return range(sweep.first_seed, sweep.first_seed + sweep.seeds)[first : first + self.layout.seeds]
 
     @property
     def rows(self) -> int:
@@ -274,7 +274,7 @@ class Engine:
             # compiled only now, so that the first chunk starts earlier
             self._compile_gain_metrics(group.config.run.precision)
             start = time.perf_counter()
-            metrics = self._complete_metrics(metrics, gains)
+            metrics = add_gain_metrics(metrics, gains, self.config.sweep.requested_metrics)
             self.run_seconds += time.perf_counter() - start
         columns = self.row_labels(chunk)
         for name in self.points.metrics:
@@ -287,10 +287,10 @@ class Engine:
         group = self.points.groups[chunk.group]
         values = group.structural | self.points.columns(chunk.points)
         columns = {path: np.broadcast_to(values[path], chunk.shape).ravel() for path in self.points.paths}
-        columns["seed"] = np.broadcast_to(chunk.seeds[:, None], chunk.shape).ravel()
+        columns["seed"] = np.repeat(chunk.seeds, len(chunk.points))
         return columns
 
-    def _pad_arguments(self, config: Config, columns: NamedArrays, seeds: np.ndarray) -> tuple[Any, Any]:
+    def _pad_arguments(self, config: Config, columns: NamedArrays, seeds: range) -> tuple[Any, Any]:
         """Arguments of a compiled program, padded to the layout: values by path, and seeds."""
 
         def pad(values: np.ndarray, size: int) -> np.ndarray:
@@ -298,7 +298,7 @@ class Engine:
 
         dtype = config.run.precision
         padded = {path: pad(np.asarray(column, dtype), self.layout.points) for path, column in columns.items()}
-        return padded, pad(seeds.astype(np.uint32), self.layout.seeds)
+        return padded, pad(np.asarray(seeds, np.uint32), self.layout.seeds)
 
     def compile_all(self) -> None:
         """Compile the programs of all groups. Raises `InputError` if the required backend cannot run one."""
@@ -312,7 +312,7 @@ class Engine:
     def _compile(self, config: Config) -> Program:
         with precision(config):
             experiment = prepare(config)
-            columns, _ = self._pad_arguments(config, self.points.columns(np.arange(1)), np.arange(1))
+            columns, _ = self._pad_arguments(config, self.points.columns(np.arange(1)), range(1))
             start = time.perf_counter()
             program = compile_program(
                 experiment,
@@ -325,20 +325,15 @@ class Engine:
             )
             self.compile_seconds += time.perf_counter() - start
             check_cost("a chunk", 1e6 * program.megabytes, "[sweep] chunk should be smaller, or left out")
-            if program.fallback_reason is not None and program.fallback_reason not in self.fallback_reasons:
+            if program.fallback_reason is not None:
                 self.fallback_reasons.append(program.fallback_reason)
             return program
 
-    def _complete_metrics(self, metrics: NamedArrays, gains: dict[str, ObserverGains]) -> Mapping[str, Any]:
-        """Metrics of a chunk, with gain metrics if any are requested."""
-        return add_gain_metrics(metrics, gains) if self._needs_gain_metrics else metrics
-
     def _compile_gain_metrics(self, dtype: str) -> None:
         """Compile the gain metrics for a precision, unless none are requested."""
-        if self._needs_gain_metrics:
-            start = time.perf_counter()
-            compile_gain_metrics(dtype, self.layout.seeds * self.layout.points)
-            self.compile_seconds += time.perf_counter() - start
+        start = time.perf_counter()
+        compile_gain_metrics(self.config.sweep.requested_metrics, dtype, math.prod(self.layout))
+        self.compile_seconds += time.perf_counter() - start
 
     def estimate(self) -> "SweepEstimate":
         """Estimate memory and time of all chunks, by a compilation and short runs of the group with most samples."""
@@ -348,7 +343,7 @@ class Engine:
             program_seconds = self.compile_seconds
             with precision(config):
                 self._compile_gain_metrics(config.run.precision)
-        compile_seconds = program_seconds * len(groups) + self.compile_seconds - program_seconds
+        compile_seconds = program_seconds * (len(groups) - 1) + self.compile_seconds
         backend: Backend = "scan" if program.fallback_reason is not None else self.backend
         # so long that the overhead of a call does not count
         predicted = self._predict_seconds(backend, config)
@@ -362,7 +357,7 @@ class Engine:
                 start = time.perf_counter()
                 metrics, gains = jax.block_until_ready(short_program.run(*arguments))
                 end = time.perf_counter()
-                self._complete_metrics(metrics, gains)
+                add_gain_metrics(metrics, gains, config.sweep.requested_metrics)
                 loop_seconds.append(end - start)
                 gain_metric_seconds.append(time.perf_counter() - end)
         # groups differ in plant steps, say; of many groups a selection is counted

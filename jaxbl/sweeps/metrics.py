@@ -731,7 +731,7 @@ def observer_gains(experiment: Experiment) -> dict[str, ObserverGains]:
     }
 
 
-def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]) -> NamedArrays:
+def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains], names: MetricNames = None) -> NamedArrays:
     """Metrics by column together with those that follow from gains and f_plus alone: margins and convergence times.
 
     They are computed apart from the loop over time, by programs that all studies share.
@@ -739,30 +739,28 @@ def add_gain_metrics(metrics: Mapping[str, Any], gains: dict[str, ObserverGains]
     Args:
         metrics: columns of the loop over time, `(seeds, points)` or numbers.
         gains: gains by side, of shapes that broadcast to that.
+        names: requested metrics; nothing is added if none of them follows from gains.
     """
     columns = {name: np.asarray(metric) for name, metric in metrics.items()}
-    for side, side_gains in gains.items():
+    for side, side_gains in (gains if needs_gain_metrics(names) else {}).items():
         f_plus = columns[f"{side}.f_plus"]
         arguments = (np.broadcast_to(argument, f_plus.shape).ravel() for argument in (*side_gains, f_plus))
         # lanes share the numbers that no axis varies
-        unique, row_index = _unique_rows(np.stack([*arguments], axis=1, dtype=f_plus.dtype))
+        rows = np.stack([*arguments], axis=1, dtype=f_plus.dtype)
+        # compared bit by bit
+        row_bytes = np.ascontiguousarray(rows).view(f"V{rows.shape[1] * rows.itemsize}")[:, 0]
+        _, first_rows, row_index = np.unique(row_bytes, return_index=True, return_inverse=True)
         # the program that the study's chunks have compiled, however few of the rows differ
-        results = apply_elementwise(compute_gain_metrics, list(unique.T), largest=f_plus.size)
+        results = apply_elementwise(compute_gain_metrics, list(rows[first_rows].T), largest=f_plus.size)
         columns |= {f"{side}.{name}": result[row_index].reshape(f_plus.shape) for name, result in results.items()}
     return columns
 
 
-def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows without repetitions, compared bit by bit, and for each row its index among them."""
-    row_bytes = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]
-    _, first, index = np.unique(row_bytes, return_index=True, return_inverse=True)
-    return rows[first], index
-
-
 @functools.cache
-def compile_gain_metrics(dtype: str, lanes: int) -> None:
+def compile_gain_metrics(names: MetricNames, dtype: str, lanes: int) -> None:
     """Compile the program of :func:`add_gain_metrics` for a number of lanes and a precision, once; all studies share it."""
-    apply_elementwise(compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
+    if needs_gain_metrics(names):
+        apply_elementwise(compute_gain_metrics, [np.ones(lanes, dtype)] * (len(ObserverGains._fields) + 1))
 
 
 @jax.jit

@@ -8,7 +8,7 @@ A refined study has the points of its fine grid, which include those of the coar
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -26,6 +26,9 @@ from .refine import CellGrid, Criterion
 
 AxisColumns = dict[str, np.ndarray]
 """Values by axis path, columns of equal length: a row is a point, or a step of axes that advance together."""
+
+PointIndices = Sequence[int] | np.ndarray
+"""Indices of points in a group."""
 
 _MAX_RUNS = 1e10
 """A day of computing on two cores, for runs of 20 000 samples (docs/speed.md): more is a mistake in the axes."""
@@ -98,11 +101,11 @@ class Points:
     def __len__(self) -> int:
         return len(self.groups) * self.group_size
 
-    def columns(self, indices: np.ndarray) -> AxisColumns:
+    def columns(self, indices: PointIndices) -> AxisColumns:
         """Values of the leaf axes at some points of a group, by path; float64 arrays of the shape of `indices`."""
-        return _take_points(self._leaf_dimensions, indices)
+        return _take_points(self._leaf_dimensions, np.asarray(indices))
 
-    def coarse_points(self, positions: np.ndarray) -> np.ndarray:
+    def coarse_points(self, positions: PointIndices) -> PointIndices:
         """Indices of points of a group that are always simulated, by their positions 0 ... coarse_size - 1 among these."""
         return positions if self.refinement is None else self.refinement.grid.coarse_indices(positions)
 

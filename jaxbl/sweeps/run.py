@@ -1,5 +1,6 @@
 """Computes the chunks of a study that are not stored yet."""
 
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -88,7 +89,7 @@ class RunTotals(NamedTuple):
     damaged: tuple[str, ...] = ()
 
     def __add__(self, other: Any) -> "RunTotals":
-        totals = RunTotals(*(a + b for a, b in zip(self, other, strict=True)))
+        totals = RunTotals(*map(operator.add, self, other))
         return totals._replace(fallback_reasons=tuple(dict.fromkeys(totals.fallback_reasons)))
 
 
@@ -180,7 +181,7 @@ class StudyRun:
                         f"{self.store.part_path(chunk.index)}: was changed by another process; run the same command again"
                     )
                 metrics = frame[columns].to_numpy(float).reshape(*chunk.shape, len(columns))
-                lanes = np.ix_(np.searchsorted(points, chunk.points), chunk.seeds - sweep.first_seed)
+                lanes = np.ix_(np.searchsorted(points, chunk.points), np.subtract(chunk.seeds, sweep.first_seed))
                 values[lanes] = metrics.swapaxes(0, 1)
             return values
 
