@@ -13,8 +13,9 @@ import stat
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -273,16 +274,14 @@ def lock_folder(folder: Path, *, shared: bool = False, wait: float = 0.0) -> Ite
         with hold_interrupts(), suppress(OSError):
             held_folders.remove(folder)
             if file is not None:
-                # the file stays while other processes share the lock
-                if not shared or _try_lock(file, shared=False):
-                    _remove_drafts(folder)
-                    with suppress(OSError):
-                        (folder / _LOCK_NAME).unlink()
-                    file.close()
-                    # Windows keeps a file that is open
-                    if os.name == "nt":
-                        (folder / _LOCK_NAME).unlink()
-                file.close()
+                with file:
+                    # the file stays while other processes share the lock
+                    if not shared or _try_lock(file, shared=False):
+                        _remove_drafts(folder)
+                        # Windows keeps a file that is open
+                        if os.name == "nt":
+                            file.close()
+                        (folder / _LOCK_NAME).unlink(missing_ok=True)
             # the system refuses to remove a folder that is not empty
             folder.rmdir()
 
@@ -429,6 +428,7 @@ def log_subject(log: Path) -> Subject:
     return Subject("log", str(log.resolve()), str(log.resolve()))
 
 
+@dataclass
 class ResultFolder:
     """A folder of results with its manifest, `manifest.json`.
 
@@ -439,8 +439,9 @@ class ResultFolder:
             its `files`, and what else the command keeps. A result that has `folders` checks what is in them itself.
     """
 
-    def __init__(self, path: Path, subject: Subject, entries: JsonObject | None = None):
-        self.path, self.subject, self.entries = path, subject, {} if entries is None else entries
+    path: Path
+    subject: Subject
+    entries: JsonObject = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path) -> "ResultFolder | None":
@@ -527,7 +528,7 @@ def claim_folder(
     subject: Subject,
     *,
     overwrite: bool = False,
-    asked: Iterable[tuple[str, str]] = (),
+    asked: tuple[str, str] = ("", ""),
     recover: Callable[[Path], ResultFolder | None] = recover_log,
 ) -> ResultFolder:
     """Check that results may be written into a folder, which is locked (:func:`lock_folder`).
@@ -536,7 +537,7 @@ def claim_folder(
         folder: folder of the results.
         subject: what they are about.
         overwrite: remove results of another subject.
-        asked: names and identities of results; others of these names are not written over, either.
+        asked: name and identity of a result; another one of this name is not written over, either.
         recover: finds out what a folder holds whose manifest is lost or damaged.
 
     Raises:
@@ -557,8 +558,8 @@ def claim_folder(
                 "another folder with --out, where they are made anew"
             )
         results = ResultFolder(folder, subject)
-    elif results.subject._replace(name=subject.name) == subject and all(
-        results.entries.get(name, {}).get("identity") in (None, identity) for name, identity in asked
+    elif results.subject._replace(name=subject.name) == subject and (
+        results.entries.get(asked[0], {}).get("identity") in (None, asked[1])
     ):
         return results
     elif not overwrite:

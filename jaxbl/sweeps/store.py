@@ -95,7 +95,7 @@ def study_head(config: Config, command: str = "sweep") -> JsonObject:
 
 def claim_study(folder: Path, config: Config, command: str = "sweep", *, overwrite: bool = False) -> ResultFolder:
     """Claim a locked folder for a command on a study (:func:`jaxbl.files.claim_folder`)."""
-    asked = () if command == "simulate" else [(command, identity(config, command))]
+    asked = command, identity(config, command)
     return claim_folder(folder, study_subject(config), overwrite=overwrite, asked=asked, recover=_recover_study)
 
 
