@@ -29,7 +29,7 @@ from .programs import (
     Backend,
     Layout,
     Program,
-    RecentResults,
+    RecentPrograms,
     check_backend,
     compile_program,
     computed_metrics,
@@ -67,34 +67,6 @@ class Chunk(NamedTuple):
 _REFINED_LANES_PER_DEVICE = 1024
 """Lanes that a device computes at once in a refined study: its batches are small, and would leave larger chunks mostly
 empty (benchmarks/NOTES.md)."""
-
-
-def layout_for(config: Config, points: Points, count: int, capacity: int) -> Layout:
-    """Choose the shape of chunks: all points before a second seed, or in a refined study all seeds before further points.
-
-    Every device gets at least two lanes: a program for a single lane would round differently.
-
-    Args:
-        config: the study.
-        points: its points.
-        count: number of devices.
-        capacity: largest number of lanes of a chunk.
-    """
-    if points.refinement is not None:
-        # a batch has few points and needs all their seeds; each device still gets 64 points of a chunk
-        seeds = min(config.sweep.seeds, max(capacity // (64 * count), 1))
-        return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
-    size = points.group_size
-    # chunks of equal size need little padding; devices share the points or else the seeds, in a multiple of their number
-    per_chunk = math.ceil(size / math.ceil(size / capacity))
-    if size >= count and size > 1:
-        per_chunk = max(math.ceil(per_chunk / count), 2) * count
-    seeds = min(config.sweep.seeds, max(capacity // per_chunk, 1))
-    if size == 1:
-        seeds = max(math.ceil(seeds / count), 2) * count
-    elif size < count:
-        seeds = math.ceil(seeds / count) * count
-    return Layout(seeds, per_chunk)
 
 
 _CHUNK_BYTES = 100
@@ -152,7 +124,7 @@ class Engine:
         self.compile_seconds = 0.0
         self.run_seconds = 0.0
         self.fallback_reasons: list[str] = []
-        self._programs = RecentResults()
+        self._programs = RecentPrograms()
 
     def _choose_backend(self) -> Backend:
         """The faster backend; it must not depend on the chunk size that is set, since backends round differently."""
@@ -170,11 +142,28 @@ class Engine:
         return min(BACKENDS, key=study_seconds)
 
     def _choose_layout(self, backend: Backend, chunk: int | None) -> Layout:
-        """Choose the chunk shape for the number of lanes that is set, or else for the number that suits the devices."""
-        if chunk is None and self.points.refinement is not None:
-            chunk = _REFINED_LANES_PER_DEVICE * len(self.devices)
-        capacity = chunk or len(self.devices) * lanes_at_once(self.devices, backend, self._operations[backend])
-        return layout_for(self.config, self.points, len(self.devices), capacity)
+        """Choose the chunk shape for the number of lanes that is set, or else for the number that suits the devices.
+
+        All points come before a second seed, or in a refined study all seeds before further points. Every device gets at
+        least two lanes: a program for a single lane would round differently.
+        """
+        count, size, seeds = len(self.devices), self.points.group_size, self.config.sweep.seeds
+        if self.points.refinement is not None:
+            capacity = chunk or _REFINED_LANES_PER_DEVICE * count
+            # a batch has few points and needs all their seeds; each device still gets 64 points of a chunk
+            seeds = min(seeds, max(capacity // (64 * count), 1))
+            return Layout(seeds, max(math.ceil(capacity / seeds / count), 2) * count)
+        capacity = chunk or count * lanes_at_once(self.devices, backend, self._operations[backend])
+        # chunks of equal size need little padding; devices share the points or else the seeds, in a multiple of their number
+        per_chunk = math.ceil(size / math.ceil(size / capacity))
+        if size >= count and size > 1:
+            per_chunk = max(math.ceil(per_chunk / count), 2) * count
+        seeds = min(seeds, max(capacity // per_chunk, 1))
+        if size == 1:
+            seeds = max(math.ceil(seeds / count), 2) * count
+        elif size < count:
+            seeds = math.ceil(seeds / count) * count
+        return Layout(seeds, per_chunk)
 
     @functools.cached_property
     def _operations(self) -> dict[Backend, Operations]:

@@ -2,10 +2,10 @@
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -42,60 +42,6 @@ def computed_metrics(backend: Backend, names: MetricNames) -> MetricNames:
     return names if backend == "fused" else None
 
 
-Result = TypeVar("Result")
-
-MAX_PROGRAMS = 16
-"""Number of compiled programs in memory, for each study and for studies that share them."""
-
-
-class RecentResults(OrderedDict[Any, Any]):
-    """The last results by key."""
-
-    def take(self, key: Any, build: Callable[[], Result]) -> Result:
-        """Return the result of a key; if it is not there, it is built, and the oldest one may be forgotten."""
-        if key not in self:
-            self[key] = build()
-        self.move_to_end(key)
-        if len(self) > MAX_PROGRAMS:
-            self.popitem(last=False)
-        return self[key]
-
-
-_shared_results: ContextVar[RecentResults | None] = ContextVar("shared", default=None)
-
-
-@contextmanager
-def share_programs() -> Iterator[None]:
-    """Let studies that run inside share programs: studies that differ only in the values of their lanes compile once.
-
-    The stages of a search for gains are such studies. Inside another such context they share its programs.
-    """
-    shared = _shared_results.get()
-    before = _shared_results.set(RecentResults() if shared is None else shared)
-    try:
-        yield
-    finally:
-        _shared_results.reset(before)
-
-
-def share_result(experiment: Experiment, paths: Iterable[str], arguments: Any, build: Callable[[], Result]) -> Result:
-    """Call `build`, or inside :func:`share_programs` return the result of an earlier call with equal arguments.
-
-    Args:
-        experiment: argument of `build`; its leaves at `paths` may differ.
-        paths: leaves on whose values the result does not depend.
-        arguments: other arguments of `build`, hashable.
-        build: makes the result.
-    """
-    results = _shared_results.get()
-    if results is None:
-        return build()
-    leaves, structure = jax.tree.flatten(set_leaves(experiment, dict.fromkeys(paths, np.zeros(()))))
-    arrays = [np.asarray(leaf) for leaf in leaves]
-    key = arguments, tuple(paths), structure, tuple((array.dtype, array.shape, array.tobytes()) for array in arrays)
-    return results.take(key, build)
-
-
 class Layout(NamedTuple):
     """Shape of a chunk: seeds and points."""
 
@@ -116,6 +62,40 @@ class Program(NamedTuple):
     run: Callable[[NamedArrays, np.ndarray], tuple[NamedArrays, dict[str, ObserverGains]]]
     megabytes: float
     fallback_reason: str | None = None
+
+
+MAX_PROGRAMS = 16
+"""Number of compiled programs in memory, for each study and for studies that share them."""
+
+
+class RecentPrograms(OrderedDict[Any, Program]):
+    """The last compiled programs by key."""
+
+    def take(self, key: Any, build: Callable[[], Program]) -> Program:
+        """Return the program of a key; if it is not there, it is built, and the oldest one may be forgotten."""
+        if key not in self:
+            self[key] = build()
+        self.move_to_end(key)
+        if len(self) > MAX_PROGRAMS:
+            self.popitem(last=False)
+        return self[key]
+
+
+_shared_programs: ContextVar[RecentPrograms | None] = ContextVar("shared", default=None)
+
+
+@contextmanager
+def share_programs() -> Iterator[None]:
+    """Let studies that run inside share programs: studies that differ only in the values of their lanes compile once.
+
+    The stages of a search for gains are such studies. Inside another such context they share its programs.
+    """
+    shared = _shared_programs.get()
+    before = _shared_programs.set(RecentPrograms() if shared is None else shared)
+    try:
+        yield
+    finally:
+        _shared_programs.reset(before)
 
 
 @contextmanager
@@ -166,9 +146,16 @@ def compile_program(
                 raise InputError(f"--backend fused: the fused loop does not support {reason}; use --backend scan") from None
             return _compile_scan(experiment, layout, devices, columns)._replace(fallback_reason=str(reason))
 
-    dtypes = tuple(column.dtype for column in columns.values())
-    arguments = layout, tuple(devices), backend, dtypes, metric_names, require_backend
-    return share_result(experiment, columns, arguments, compile_backend)
+    shared = _shared_programs.get()
+    if shared is None:
+        return compile_backend()
+    # a program does not depend on the values of the lanes
+    leaves, structure = jax.tree.flatten(set_leaves(experiment, dict.fromkeys(columns, np.zeros(()))))
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    values = tuple((array.dtype, array.shape, array.tobytes()) for array in arrays)
+    dtypes = tuple((path, column.dtype) for path, column in columns.items())
+    key = layout, tuple(devices), backend, dtypes, metric_names, require_backend, structure, values
+    return shared.take(key, compile_backend)
 
 
 def _compile_fused(

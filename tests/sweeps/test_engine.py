@@ -13,8 +13,7 @@ from jaxbl.config import read_config, with_values
 from jaxbl.errors import InputError
 from jaxbl.report.results import describe
 from jaxbl.sweeps import engine
-from jaxbl.sweeps.engine import Engine, Layout, layout_for
-from jaxbl.sweeps.points import Points
+from jaxbl.sweeps.engine import Engine, Layout
 from jaxbl.sweeps.sweep import StudyResult, dry_run, sweep
 from jaxbl.sweeps.trial import run
 
@@ -173,10 +172,9 @@ def test_layouts():
     """Whole rows of points first, then seeds; two lanes a device at least; little padding."""
 
     def layout(points, seeds, devices, capacity):
-        config = read_config(
-            small_study(axes=[spaced_axis(ALPHA, 1.0, 2.0, points)] if points > 1 else [], sweep={"seeds": seeds})
-        )
-        return tuple(layout_for(config, Points(config), devices, capacity))
+        axes = [spaced_axis(ALPHA, 1.0, 2.0, points)] if points > 1 else []
+        config = read_config(small_study(axes=axes, sweep={"seeds": seeds, "chunk": capacity}))
+        return tuple(Engine(config, devices=[SimpleNamespace(platform="cpu")] * devices, backend="scan").layout)
 
     assert layout(12288, 1, 2, 8192) == (1, 6144)
     assert layout(4096, 10, 1, 4096) == (1, 4096)
