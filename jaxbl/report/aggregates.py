@@ -1,7 +1,7 @@
 """Medians, means and extremes of a study's runs by groups, in memory that does not grow with the number of runs.
 
-Few rows are kept; many are read part by part as often as is needed. Medians are exact either way: many values
-are sorted in a file.
+Few rows are kept; many are read part by part as often as is needed. Medians are exact either way: values are sorted in a
+file.
 """
 
 # pandas' own annotations are wider than what its methods return
@@ -21,8 +21,6 @@ from jaxbl.sweeps.sweep import StudyResult
 
 Array = np.ndarray
 
-MOST_VALUES = 4_000_000
-"""Sorted in memory: 32 MB."""
 _MOST_KEPT = 20_000_000
 """Values of rows that are kept: 160 MB."""
 
@@ -67,22 +65,18 @@ class Groups:
     def __init__(self, rows: Iterable[DataFrame], keys: Sequence[str], further: Sequence[str] = ()):
         keys = self._keys = list(keys)
         self._rows = rows
-        distinct, first = list[DataFrame](), {}
+        index, first = None, {}
         self.varied, self.columns = set[str](), set[str]()
         for frame in rows:
-            self.columns |= {*frame}
+            self.columns = {*frame}
             if keys:
-                distinct.append(frame[keys].drop_duplicates())
-                # seldom, as it goes through all that differ
-                if sum(map(len, distinct[1:])) > len(distinct[0]) + 10_000:
-                    distinct = [pd.concat(distinct).drop_duplicates()]
+                there = frame.set_index(keys).index.unique()
+                index = there if index is None else index.union(there)
             for name in further if len(frame) else ():
                 column = frame[name].to_numpy()
                 if (column != first.setdefault(name, column[0])).any():
                     self.varied.add(name)
-        self.index: pd.Index = pd.RangeIndex(1)
-        if keys:
-            self.index = pd.concat(distinct).drop_duplicates().sort_values(keys).set_index(keys).index
+        self.index: pd.Index = pd.RangeIndex(1) if index is None else index.sort_values()
 
     def __len__(self) -> int:
         return len(self.index)
@@ -93,48 +87,39 @@ class Groups:
             return np.zeros(len(frame), np.int64)
         return self.index.get_indexer(frame.set_index(self._keys).index)
 
-    def _read(self, *columns: Column) -> Iterator[tuple[Array, list[Array]]]:
-        """Groups of the rows, and numbers by column, part by part."""
-        for frame in self._rows:
-            yield self.of(frame), [np.asarray(column(frame), float) for column in columns]
-
     def _numbers(self, column: Column) -> Iterator[tuple[Array, Array]]:
         """Groups and numbers of the rows that have one, part by part."""
-        for groups, (values,) in self._read(column):
+        for frame in self._rows:
+            values = np.asarray(column(frame), float)
             there = ~np.isnan(values)
-            yield groups[there], values[there]
+            yield self.of(frame)[there], values[there]
 
     def means(self, columns: dict[str, Column]) -> DataFrame:
         """Means of numbers by group, NaN left out, and the number of rows in `rows`."""
-        rows, (sums, counts) = np.zeros(len(self), np.int64), np.zeros((2, len(columns), len(self)))
-        for groups, numbers in self._read(*columns.values()):
-            np.add.at(rows, groups, 1)
-            for total, count, values in zip(sums, counts, numbers, strict=True):
+        columns = columns | {"rows": lambda frame: np.ones(len(frame))}
+        sums, counts = np.zeros((2, len(columns), len(self)))
+        for frame in self._rows:
+            groups = self.of(frame)
+            for i, column in enumerate(columns.values()):
+                values = np.asarray(column(frame), float)
                 there = ~np.isnan(values)
-                np.add.at(total, groups[there], values[there])
-                np.add.at(count, groups[there], 1.0)
-        return DataFrame(sums.T, self.index, [*columns]).div(counts.T).assign(rows=rows)
+                sums[i] += np.bincount(groups, np.where(there, values, 0.0), len(self))
+                counts[i] += np.bincount(groups, there, len(self))
+        return DataFrame(sums.T, self.index, [*columns]).div(counts.T).assign(rows=counts[-1].astype(int))
 
     def spread(self, column: Column) -> DataFrame:
         """The `least`, `median` and `largest` of a column's numbers by group, NaN left out; NaN where a group has none."""
         count = np.zeros(len(self), np.int64)
-        for groups, _ in self._numbers(column):
-            count += np.bincount(groups, minlength=len(self))
-        ends, total, last = np.cumsum(count), count.sum(), np.maximum(count - 1, 0)
-        first = ends - count
         with TemporaryFile() as file:
-            # values of a group side by side, and one more for groups without any
-            size = total + 1
-            grouped = np.memmap(file, float, "w+", shape=size) if total > MOST_VALUES else np.empty(size)
-            grouped[-1], free = np.nan, first.copy()
             for groups, values in self._numbers(column):
-                order = np.argsort(groups, kind="stable")
-                groups = groups[order]
-                grouped[free[groups] + np.arange(len(groups)) - np.searchsorted(groups, groups)] = values[order]
-                free += np.bincount(groups, minlength=len(self))
-            for start, end in zip(first, ends, strict=True):
-                grouped[start:end].sort()
-            # the median lies between two ranks; a group without numbers has the one behind all others
-            ranks = (np.where(count == 0, total, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
-            least, below, above, largest = (grouped[rank] for rank in ranks)
+                count += np.bincount(groups, minlength=len(self))
+                np.column_stack([groups, values]).tofile(file)
+            np.full(2, np.nan).tofile(file)
+            # complex numbers are sorted by their real parts, the groups, and then by the others; nan is behind all
+            pairs = np.memmap(file, complex, "r+")
+            pairs.sort()
+            first, last = np.cumsum(count) - count, np.maximum(count - 1, 0)
+            # the median lies between two ranks; a group without numbers has the nan
+            ranks = (np.where(count == 0, len(pairs) - 1, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
+            least, below, above, largest = (pairs[rank].imag for rank in ranks)
         return DataFrame({"least": least, "median": 0.5 * (below + above), "largest": largest}, self.index)

@@ -27,12 +27,10 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("kind", NUMBERS)
-@pytest.mark.parametrize("most", [10, 150, 10**9])
-def test_spread_is_that_of_pandas(monkeypatch, kind, most):
+def test_spread_is_that_of_pandas(kind):
     rng = np.random.default_rng(3)
     group_of, values = rng.integers(0, 20, 3000), NUMBERS[kind](rng, 3000)
     values[(rng.random(3000) < 0.1) | (group_of == 7)] = np.nan
-    monkeypatch.setattr(aggregates, "MOST_VALUES", most)
     frame = pd.DataFrame({"group": group_of, "value": values})
     rows = [frame.iloc[i : i + 257] for i in range(0, 3000, 257)]
     actual = Groups(rows, ["group"]).spread(itemgetter("value"))
@@ -121,7 +119,6 @@ def test_reports_are_the_same_part_by_part(tmp_path, monkeypatch, kind):
     for folder in (full, parts):
         folder.mkdir()
         lines.append(write_report(result, folder))
-        monkeypatch.setattr(aggregates, "MOST_VALUES", 64)
         monkeypatch.setattr(aggregates, "_MOST_KEPT", 0)
     assert lines[0] == lines[1]
     # values of figures are in the page
