@@ -6,8 +6,7 @@ needs them.
 
 import base64
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,17 +34,15 @@ _FILES = (
 """Of every page; scripts in the order in which they are loaded."""
 
 
-@contextmanager
-def points_writer(out: Path, types: Mapping[str, type]) -> Iterator[Callable[[Any], None]]:
-    """A function that adds columns of rows to `points.parquet`, by their NumPy types."""
-    schema = pa.schema([(name, pa.from_numpy_dtype(dtype)) for name, dtype in types.items()])
+def write_points(out: Path, types: Mapping[str, type], parts: Iterable[Any]) -> int:
+    """Write columns of rows, part by part and by their NumPy types, to `points.parquet`. Returns the number of rows."""
+    schema, rows = pa.schema([(name, pa.from_numpy_dtype(dtype)) for name, dtype in types.items()]), 0
     with pq.ParquetWriter(out / "points.parquet", schema, use_dictionary=False) as writer:
-
-        def write(columns: Any) -> None:
-            arrays = {name: np.asarray(columns[name], float).astype(dtype) for name, dtype in types.items()}
-            writer.write_table(pa.table(arrays, schema=schema), row_group_size=ROW_GROUP)
-
-        yield write
+        for part in parts:
+            table = pa.table({name: np.asarray(part[name], float).astype(dtype) for name, dtype in types.items()}, schema)
+            writer.write_table(table, row_group_size=ROW_GROUP)
+            rows += len(table)
+    return rows
 
 
 class Source(NamedTuple):

@@ -6,7 +6,7 @@ Rows of `points.parquet` are in the order of the axes, which need not be stored 
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryFile
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from jaxbl.report.panels import Array, pack_numbers
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP, page_values, points_writer
+from .folder import ROW_GROUP, page_values, write_points
 
 _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
@@ -65,20 +65,17 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path, d
     ]
     shape = [_length(dim) for dim in dims]
     rows, runs = math.prod(shape), 0
-    with (
-        TemporaryDirectory(dir=out, prefix=".draft.") as place,
-        points_writer(out, dict.fromkeys(metrics, np.float32)) as write,
-    ):
-        columns = {name: np.memmap(Path(place) / str(i), np.float32, "w+", shape=(rows,)) for i, name in enumerate(metrics)}
-        for values in columns.values():
-            values[:] = np.nan
+    with TemporaryFile(dir=out) as file:
+        numbers = np.memmap(file, np.float32, "w+", shape=(len(metrics), rows))
+        numbers[:] = np.nan
+        columns = dict(zip(metrics, numbers, strict=True))
         for frame in result.batches():
             places = np.ravel_multi_index([_places(dim, frame) for dim in dims], shape)
             runs += len(frame)
             for name, values in columns.items():
                 values[places] = page_values(frame, name)
-        for start in range(0, rows, ROW_GROUP):
-            write({name: values[start : start + ROW_GROUP] for name, values in columns.items()})
+        parts = np.split(numbers, range(ROW_GROUP, rows, ROW_GROUP), axis=1)
+        write_points(out, dict.fromkeys(metrics, np.float32), (dict(zip(metrics, part, strict=True)) for part in parts))
         x, y = _first_axes(result.config, dims)
         cells = {name: np.moveaxis(values.reshape(shape), (y, x), (-2, -1)) for name, values in columns.items()}
         telling = _most_telling(cells, first)

@@ -1,7 +1,6 @@
 """Signals over time in a browser: a log and what models make of it, a simulated run, and what a watch saw."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from jaxbl.records import POSITION_CHANNELS
 from jaxbl.report.panels import missing_quantity
 from jaxbl.report.watch import LABELS
 
-from .folder import Source, colours_of, points_writer, write_page
+from .folder import Source, colours_of, write_page, write_points
 
 
 def log_source(file: Path, title: str, sentences: Sequence[str]) -> Source:
@@ -54,8 +53,12 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         frame = frame.assign(**observer_errors(frame)).rename(columns={"z": "twist"})
     coordinates = _coordinates(frame, units)
     is_watch = "alarm_gap" in summary
-    asked = _watch_groups(summary, frame) if is_watch else _groups(summary, frame, units)
-    groups = [group for group in asked if group["lines"]]
+    asked = _watch_groups(summary) if is_watch else _groups(summary, frame, units)
+    groups = [
+        {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": there}
+        for name, quantity, unit, lines, bandwidth in asked
+        if (there := [{"column": column, "label": label} for column, label in lines.items() if column in frame])
+    ]
     if is_watch:
         coordinates += [group["lines"][0] | {"unit": group["unit"]} for group in groups]
     if not groups:
@@ -65,8 +68,7 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
     lines = [*coordinates, *(line for group in groups for line in group["lines"])]
     drawn = {"held_out", *(line["column"] for line in lines)}
     # float32 would round times; what is not there stays nan, which a page reads as a number
-    with points_writer(out, {name: np.float64 if name == "t" else np.float32 for name in frame if name in drawn}) as write:
-        write(frame)
+    write_points(out, {name: np.float64 if name == "t" else np.float32 for name in frame if name in drawn}, [frame])
     return {
         "rows": len(frame),
         "period": summary.get("every") or summary.get("sample_period") or float(np.median(np.diff(frame["t"]))),
@@ -84,20 +86,16 @@ def observer_errors(trace: DataFrame) -> JsonObject:
     return {f"{name}_error": trace[name] - trace[f"{name}_estimate"] for name in names if f"{name}_estimate" in trace}
 
 
-def _group(
-    frame: DataFrame, name: str, quantity: str, unit: str, lines: Mapping[str, str], bandwidth: float | None = None
-) -> JsonObject:
-    """A figure: its quantity, and the columns that are there, each with a label."""
-    drawn = [{"column": column, "label": label} for column, label in lines.items() if column in frame]
-    return {"name": name, "quantity": quantity, "unit": unit, "bandwidth": bandwidth, "lines": drawn}
+_Group = tuple[str, str, str, Mapping[str, str], float | None]
+"""A figure: its name, quantity and unit, columns with their labels, and the bandwidth that is shown at first, if any."""
 
 
-def _watch_groups(summary: JsonObject, frame: DataFrame) -> Iterable[JsonObject]:
+def _watch_groups(summary: JsonObject) -> Iterable[_Group]:
     """The figures of a watch: each number by both observers."""
     for name, label in LABELS.items():
         lines = {f"{side}.{name}": f"{label} by the {side} observer" for side in POSITION_CHANNELS}
         lines |= {f"{name}_{end}": f"{label} {end}, with 95 %" for end in ("from", "to")}
-        yield _group(frame, label, label, summary["units"]["motor"][name], lines)
+        yield label, label, summary["units"]["motor"][name], lines, None
 
 
 def _units(summary: JsonObject) -> dict[str, str]:
@@ -149,13 +147,12 @@ def _first(summary: JsonObject, frame: DataFrame) -> list[str]:
     return [_NAMES[name] for name in names[:2]]
 
 
-def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> Iterable[JsonObject]:
+def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> Iterable[_Group]:
     """The figures of a log, the first two lines of each at the beginning."""
-    group, sides = partial(_group, frame), units.items()
     law, speed = ("true", "true") if "single_run" in summary else ("by the fitted law", "smoothed")
     bandwidths = summary.get("gap", {}).get("holdout", {}).get("bandwidth", {})
     last = summary["findings"][-1]["effect"] if summary.get("findings") else ""
-    for side, unit in sides:
+    for side, unit in units.items():
         quantity = f"missing {missing_quantity(_force(unit))}"
         lines = {
             f"{side}.missing_before": "model as given",
@@ -168,22 +165,22 @@ def _groups(summary: JsonObject, frame: DataFrame, units: Mapping[str, str]) -> 
             elif kind == "missing_with":
                 lines[column] = f"with {effect} in place of {last}"
         lines[f"{side}.observed_before"] = "model as given, by the observer"
-        yield group(f"{side}: {quantity}", quantity, _force(unit), lines, bandwidths.get(side))
-    for side, unit in sides:
+        yield f"{side}: {quantity}", quantity, _force(unit), lines, bandwidths.get(side)
+    for side, unit in units.items():
         for name, quantity, per, label in (
             ("residual", "position residual", "", "measured less the model's"),
             ("velocity_error", "velocity error", "/s", "true less observed"),
             ("position_error", "position error", "", "true less observed"),
         ):
-            yield group(f"{side}: {quantity}", quantity, unit + per, {f"{side}.{name}": label})
+            yield f"{side}: {quantity}", quantity, unit + per, {f"{side}.{name}": label}, None
     force = _force(units["motor"])
     lines = {"transmitted": "measured", "torque": law, "torque_by_motor": "by the motor's side"}
     lines |= {f"{side}.torque_estimate": f"by the {side} observer" for side in units}
     if summary.get("kind") == "element":
         lines = {"u": "measured", "torque": "by the fitted law"}
     name = "torque in the transmission" if {"transmitted", "torque"} & {*frame} else "disturbance torque"
-    yield group(name, missing_quantity(force), force, lines)
-    for side, unit in sides:
+    yield name, missing_quantity(force), force, lines, None
+    for side, unit in units.items():
         lines = {f"{side}.velocity": speed, f"{side}.velocity_estimate": "by the observer"}
         if f"{side}.velocity_estimate" in frame:
-            yield group(f"{side}: speed", "speed", f"{unit}/s", lines)
+            yield f"{side}: speed", "speed", f"{unit}/s", lines, None

@@ -77,8 +77,8 @@ class ExplorerServer(ThreadingHTTPServer):
         self.source, self._place = source, place
         self.token = secrets.token_urlsafe(24)
         self._lock, self._stale = threading.Lock(), True
-        # folders of its versions, and which of these a browser has loaded
-        self._pages, self._loaded = {}, set()
+        # the number of its versions, and which of these a browser has loaded
+        self._versions, self._loaded = 0, set()
         super().__init__(("127.0.0.1", port), _Handler)
         self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
         self.url = f"http://127.0.0.1:{self.server_port}/{self.token}/"
@@ -111,16 +111,16 @@ class ExplorerServer(ThreadingHTTPServer):
         """
         with self._lock:
             if self._stale:
-                folder = self._place / str(len(self._pages) + 1)
+                folder = self._place / str(self._versions + 1)
                 folder.mkdir()
                 try:
                     self._stale = self.source.write(folder, True)
                 except BaseException:
                     shutil.rmtree(folder)
                     raise
-                self._pages[folder.name] = folder
-                shutil.rmtree(self._place / str(len(self._pages) - _MOST_VERSIONS), ignore_errors=True)
-            return str(len(self._pages))
+                self._versions += 1
+                shutil.rmtree(self._place / str(self._versions - _MOST_VERSIONS), ignore_errors=True)
+            return str(self._versions)
 
     def is_outdated(self, version: str, name: str) -> bool:
         """True if a page is loaded again while there is, or may be, a newer version of it."""
@@ -128,13 +128,14 @@ class ExplorerServer(ThreadingHTTPServer):
             return False
         with self._lock:
             again = version in self._loaded
-            self._loaded |= {version} & self._pages.keys()
-            return again and (self._stale or version != str(len(self._pages)))
+            self._loaded.add(version)
+            return again and (self._stale or version != str(self._versions))
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
-        files = self._pages[version].glob("*") if version in self._pages else ()
-        return next((file for file in files if file.name == name and file.is_file()), None)
+        # names are compared, so that none leads elsewhere
+        files = (file for file in self._place.glob("*/*") if file.is_file())
+        return next((file for file in files if file.parts[-2:] == (version, name)), None)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -24,7 +24,7 @@ from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run, run_perturbed
 
-from .folder import Source, colours_of, drawable, page_values, points_writer, write_page
+from .folder import Source, colours_of, drawable, page_values, write_page, write_points
 from .grid import dimensions, write_grid
 from .log import observer_errors
 
@@ -124,14 +124,15 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> JsonObjec
         metrics: columns that are kept.
         out: folder.
     """
-    config, rows = result.config, 0
+    config = result.config
     words = {axis.path: list(axis.values or ()) for axis in config.axes if has_words(axis)}
     types = dict.fromkeys([*config.axis_paths, "seed"], np.float64) | dict.fromkeys(metrics, np.float32)
-    with points_writer(out, types) as write:
-        for frame in result.batches():
-            places = {path: frame[path].map(values.index) for path, values in words.items()}
-            write(frame.assign(**places, **{name: page_values(frame, name) for name in metrics}))
-            rows += len(frame)
+
+    def page_columns(frame: pd.DataFrame) -> pd.DataFrame:
+        places = {path: frame[path].map(values.index) for path, values in words.items()}
+        return frame.assign(**places, **{name: page_values(frame, name) for name in metrics})
+
+    rows = write_points(out, types, map(page_columns, result.batches()))
     descriptions = [
         axis_words(config, axis.path) | {"words": words.get(axis.path), "log": axis.scale == "log"} for axis in config.axes
     ]
