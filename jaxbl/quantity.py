@@ -1,4 +1,4 @@
-"""A number with its uncertainty and its unit, as text, as an entry of a JSON file, and as cells of a table."""
+"""A number with its uncertainty and its unit, as text, and as an entry of a JSON file."""
 
 import math
 from collections.abc import Sequence
@@ -46,10 +46,6 @@ class Quantity:
         """Return the ends of the interval; where one is not known, the value itself."""
         return [end if math.isfinite(end) else self.value for end in self.interval or ()]
 
-    def row(self) -> list[Any]:
-        """Return the cells below :data:`QUANTITY_COLUMNS`."""
-        return [self.value, self.standard_error, *(self.interval or (None, None)), self.unit, self.nominal]
-
     @property
     def is_finite(self) -> bool:
         """True if value and standard error are known."""
@@ -85,6 +81,3 @@ def _read_number(content: Any) -> Any:
 def read_quantities(entries: JsonObject) -> dict[str, Quantity]:
     """Return the quantities of entries of a JSON file, by path."""
     return {path: Quantity.read(entry) for path, entry in entries.items()}
-
-
-QUANTITY_COLUMNS = "value", "standard error", "95 % from", "to", "unit", "nominal"

@@ -10,7 +10,7 @@ import tomli_w
 
 from jaxbl.files import to_jsonable
 from jaxbl.lines import DOUBT, doubts_among
-from jaxbl.quantity import QUANTITY_COLUMNS, Quantity
+from jaxbl.quantity import Quantity
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 _FIGURES = 4
@@ -27,8 +27,13 @@ def number_table(
     heading: str, numbers: Mapping[str, Quantity], profiles: Mapping[str, Sequence[float] | None] = {}
 ) -> ResultTable:
     """Table of numbers by path, with intervals by profile likelihood, and without columns that would be empty."""
-    rows = [[path, *number.row(), *(profiles.get(path) or (None, None))] for path, number in numbers.items()]
-    columns = ["path", *QUANTITY_COLUMNS, "by profile from", "to"]
+    unknown = None, None
+    rows = [
+        [path, number.value, number.standard_error, *(number.interval or unknown), number.unit, number.nominal,
+         *(profiles.get(path) or unknown)]
+        for path, number in numbers.items()
+    ]  # fmt: skip
+    columns = ["path", "value", "standard error", "95 % from", "to", "unit", "nominal", "by profile from", "to"]
     table = pd.DataFrame(rows, columns=columns).dropna(axis=1, how="all")
     return ResultTable(heading, list(table), to_jsonable(table.to_numpy()))
 

@@ -1,10 +1,8 @@
 """Result, figures and report of what Python calls and commands return."""
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from html import escape
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,9 +11,7 @@ from jaxbl.files import ResultFolder, Subject, lock_folder, log_subject, to_json
 from jaxbl.fused import SCAN_MESSAGE
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import format_duration
-from jaxbl.records import Inspection
 from jaxbl.result import Result
-from jaxbl.sweeps.compare import Comparison
 from jaxbl.sweeps.store import study_subject
 from jaxbl.validation import suggest_word
 
@@ -47,13 +43,11 @@ class _Kind(NamedTuple):
             and returns the study or model that the page shows, as TOML; nothing where that is the result's `config`.
         file: what was found, as data, or the page where that is all; names the result in the manifest of its folder.
         subject: what the result is about.
-        summary: what the file holds.
     """
 
     report: Any
     file: str = PAGE
     subject: Callable[[Any], Subject] = lambda result: study_subject(result.config)
-    summary: Callable[[Any], JsonObject] = attrgetter("summary")
 
 
 def _log(result: Any) -> Subject:
@@ -70,8 +64,8 @@ _KINDS = {
         _Kind(observer_choice, "tuning.json"),
         _Kind(loop_gains, "tuning.json"),
         _Kind(verify),
-        _Kind(compare, "comparison.json", lambda _: Subject("comparison"), Comparison.to_dict),
-        _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path), Inspection.to_dict),
+        _Kind(compare, "comparison.json", lambda _: Subject("comparison")),
+        _Kind(inspect, "inspection.json", lambda result: log_subject(result.record.path)),
         _Kind(identify, "identification.json", _log),
         _Kind(element, "identification.json", _log),
         _Kind(diagnose, "diagnosis.json", _log),
@@ -142,19 +136,19 @@ def write_report(result: Any, folder: str | Path | ResultFolder, described: Resu
         NoResult: the files cannot be written.
     """
     kind, described = _kind_of(result), described or describe(result)
-    identity = (getattr(result, "summary", None) or {}).get("identity", "")
-    with ExitStack() as stack:
-        if not isinstance(folder, ResultFolder):
-            place = to_path(folder)
-            stack.enter_context(lock_folder(place, wait=_WAIT))
-            folder = ResultFolder.read(place) or ResultFolder(place, kind.subject(result))
-        # without details, of which one is how long compiling took: the same results have the same manifest
-        sentences = replace(described, details=()).sentences
-        draft = stack.enter_context(
-            folder.write_files(kind.file, identity=identity, title=described.title, sentences=sentences)
-        )
+    if not isinstance(folder, ResultFolder):
+        place = to_path(folder)
+        with lock_folder(place, wait=_WAIT):
+            results = ResultFolder.read(place) or ResultFolder(place, kind.subject(result))
+            return write_report(result, results, described)
+    summary: JsonObject = getattr(result, "summary", None) or {}
+    # without details, of which one is how long compiling took: the same results have the same manifest
+    sentences = replace(described, details=()).sentences
+    with folder.write_files(
+        kind.file, identity=summary.get("identity", ""), title=described.title, sentences=sentences
+    ) as draft:
         if kind.file != PAGE:
-            write_json(draft / kind.file, to_jsonable(kind.summary(result)))
+            write_json(draft / kind.file, to_jsonable(summary or result.to_dict()))
         config = kind.report.write(result, draft) or result.config.to_toml()
         write_page(draft, described, kind.report.draw(result), config)
     return described
