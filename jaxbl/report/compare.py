@@ -16,7 +16,7 @@ from jaxbl.files import write_atomic
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.compare import FALSE_DISCOVERY_RATE, Comparison, MetricChange
 
-from .maps import value_label
+from .maps import value_label, value_text
 from .panels import BLUE, Axis, Figure, Panel, Span, intervals, name_rows
 
 _ROWS = 12
@@ -65,7 +65,7 @@ def describe(comparison: Comparison) -> Result:
         f"{name} is not finished: {there} of {total} runs are compared."
         for name, (there, total) in comparison.unfinished.items()
     ]
-    changes = ", ".join(f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in comparison.made_by.items())
+    changes = ", ".join(f"{key} {value_text(old)} -> {value_text(new)}" for key, (old, new) in comparison.made_by.items())
     alone = f"; {first} in the first alone, {second} in the second alone" if first or second else ""
     remarks += [
         "" if comparison.config else "The configs differ in nothing that decides a number.",
@@ -77,7 +77,7 @@ def describe(comparison: Comparison) -> Result:
         gone = ", ".join(f"{change.metric} ({change.only[i]} runs)" for change in comparison.metrics if change.only[i])
         remarks.append(gone and f"A number in {study} alone: {gone}.")
     figures = [KeyFigure(_factor(change), f"{change.metric}: {_ways(change)}") for change in changed[:4]]
-    rows = [[key, *map(_value, values)] for key, values in comparison.config.items()]
+    rows = [[key, *map(value_text, values)] for key, values in comparison.config.items()]
     tables = [ResultTable("What differs in the config", ["key", *names], rows)] * bool(rows)
     if changed:
         head = ["metric", "points", "better", "worse", "factor from first to second (99 %)"]
@@ -123,12 +123,6 @@ def _factor(change: MetricChange) -> str:
         return "–"
     value, *interval = (f"{100 * end:+.2f} %" if is_boolean(change.metric) else f"× {end:.3g}" for end in ends)
     return f"{value} ({' to '.join(interval)})" if interval else value
-
-
-def _value(value: Any) -> str:
-    if value is None:
-        return "(none)"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def draw(comparison: Comparison) -> list[Figure]:

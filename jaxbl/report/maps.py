@@ -1,19 +1,21 @@
 """Figures of a sweep: maps with gain conditions over them, and lines over one axis."""
 
-# pandas' own annotations are wider than what its methods return
+# pandas' and SciPy's own annotations are wider than what their methods return
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # pyright: reportReturnType=false, reportAssignmentType=false
 
 import re
 from collections.abc import Iterable
 from functools import lru_cache, partial
-from itertools import cycle
+from itertools import cycle, groupby
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.ticker import EngFormatter
 from pandas import DataFrame, Series
+from scipy.spatial import KDTree
 
 from jaxbl.config import Config, FigureTable, is_boolean, numeric_paths
 from jaxbl.config.figures import filter_rows, resolve_where
@@ -28,7 +30,6 @@ from .aggregates import Groups, Rows
 from .checks import MOST_PARTS, check_figures, has_words, values_of
 from .gain_plane import condition_curves
 from .panels import COLOURS, Array, Axis, Band, Figure, Line, Map, Panel, Scale, arrange, mark, with_unit
-from .refined_maps import Filling
 
 
 def default_figures(config: Config, columns: list[str]) -> list[FigureTable]:
@@ -90,9 +91,8 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     def select(frame: DataFrame) -> DataFrame:
         frame = filter_rows(frame[points.on_coarse_grid(frame.assign(**starts))], resolve_where(config, figure))
         for axis in random:
-            middles = axis.model_copy(update={"num": 2 * bins + 1}).grid()[1::2]
-            edges = cell_edges(middles, axis.scale == "log")[1:-1]
-            frame = frame.assign(**{axis.path: middles[np.searchsorted(edges, frame[axis.path])]})
+            halves = axis.model_copy(update={"num": 2 * bins + 1}).grid()
+            frame = frame.assign(**{axis.path: halves[1::2][np.searchsorted(halves[2:-1:2], frame[axis.path])]})
         return frame
 
     return Rows(result, [*config.axis_paths, "seed", *metrics], select)
@@ -148,12 +148,15 @@ def with_value(config: Config, path: str | None, value: Any) -> str:
         return ""
     unit = unit_of(config, path)
     small = unit and not isinstance(value, str) and 1e-9 <= abs(value) < 1e-2
-    text = EngFormatter(unit).format_data(value) if small else f"{_text(value)} {unit}".rstrip()
+    text = EngFormatter(unit).format_data(value) if small else f"{value_text(value)} {unit}".rstrip()
     return f"{path_words(config, path)} {text}"
 
 
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
+def value_text(value: Any) -> str:
+    """A value of a config as text."""
+    if value is None:
+        return "(none)"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def value_words(value: str) -> str:
@@ -260,14 +263,17 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
     scale = colour_scale(table["shown"].to_numpy(float), value_label(metric), spec.scale)
     if is_boolean(metric):
         scale = scale._replace(low=0.0, high=1.0, log=False)
-    failure, drawn = _failure_name(table[table["failed"]], metric), []
+    failure, drawn, failures = "", [], table[table["failed"]]
+    if len(failures):
+        word = "not converged" if converged in failures or "time" in metric else "undefined"
+        failure = f"{'diverged' if (failures['finite'] < 1.0).all() else word} ({len(failures)} points)"
     for i, (value, part) in enumerate(_split(table, spec.facet)):
         plane = part[["value", "failed"]].astype(float)
         # what an unfinished study has not computed yet stays white
         plane = plane if filling is None else filling.fill(plane).fillna({"failed": 1.0})
         grid, failed = (plane[name].unstack() for name in plane)
-        centres = (index.to_numpy(float) for index in (grid.columns, grid.index))
-        (x, x_edges), (y, y_edges) = (axis_of(config, *axis) for axis in zip(axes, centres, strict=True))
+        x, x_edges = axis_of(config, spec.x, grid.columns.to_numpy(float))
+        y, y_edges = axis_of(config, spec.y, grid.index.to_numpy(float))
         parts = [Map(x_edges, y_edges, grid.to_numpy(), scale, failed.to_numpy() > 0.5, failure)]
         under = [flat_remark(part["shown"].to_numpy(float))]
         if errors and (best := best_gains(errors[value])):
@@ -284,6 +290,61 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
     return drawn, f" and {path_words(config, spec.y)}{_over(config, groups.varied, spec)}."
 
 
+_MOST_SHOWN = 1025
+"""Places along an axis of a map; finer ones would not be seen."""
+
+
+class Filling:
+    """The plane of a map over two axes (paths `x` and `y`) of a refined study, by the rows that it has: every place of the
+    fine grid is shown by the nearest point that was simulated.
+
+    Without refinement in its neighbourhood that is a point of the coarse grid: its block is one coarse cell, centred on it.
+    """
+
+    def __init__(self, points: Points, frame: DataFrame, x: str, y: str):
+        assert points.refinement is not None
+        # values of each axis, and how many of them a coarse cell has
+        self._axes = {}
+        for path in (y, x):
+            refined = path in points.refinement.paths
+            values = points.axis_values(path) if refined else np.unique(frame[path].to_numpy(float))
+            self._axes[path] = values, 1 << refined * points.refinement.grid.depth
+
+    def _places(self, frame: DataFrame) -> Array:
+        """Positions `(rows, 2)` of a frame's rows in the plane, in coarse cells."""
+        return np.column_stack([np.searchsorted(values, frame[path]) / cell for path, (values, cell) in self._axes.items()])
+
+    def _nearest(self, simulated: DataFrame, asked: DataFrame) -> Array:
+        """The simulated row nearest to each row asked for, within half a coarse cell; their number where there is none."""
+        # of two that are as near the upper one
+        return KDTree(self._places(simulated)).query(self._places(asked) + 1e-6, p=np.inf, distance_upper_bound=0.50001)[1]
+
+    def fill(self, table: DataFrame) -> DataFrame:
+        """A table over (y, x) on the whole plane: rows of the nearest places, NaN where there is none."""
+        # all values of an axis, or every 2nd, 4th, ...
+        drawn = [
+            values[:: min(1 << ((len(values) - 1) // _MOST_SHOWN).bit_length(), cell)]
+            for values, cell in self._axes.values()
+        ]
+        plane = pd.MultiIndex.from_product(drawn, names=[*self._axes])
+        nearest = self._nearest(table.index.to_frame(), plane.to_frame())
+        return table.reset_index(drop=True).reindex(nearest).set_axis(plane)
+
+    def complete(self, frame: DataFrame, paths: list[str]) -> DataFrame:
+        """A frame in which each vertex that was simulated at any values of the other axes has rows at all of them.
+
+        Medians and shares over these axes would else be over those alone at which the vertex lies on a boundary.
+        """
+        if not paths or frame.empty:
+            return frame
+        vertices, parts = frame[[*self._axes]].drop_duplicates(), []
+        for _, part in frame.groupby([*paths, "seed"], sort=False):
+            nearest = self._nearest(part, vertices)
+            there = nearest < len(part)
+            parts.append(part.iloc[nearest[there]].assign(**vertices[there].to_dict("list")))
+        return pd.concat(parts, ignore_index=True)
+
+
 def _map_table(groups: Groups, value: str) -> DataFrame:
     """The places of a map: `value`, whether it is none that means something (`failed`: too few of its runs converged, or
     one diverged), and the shares of runs that are `finite` and converged, of the columns that there are."""
@@ -297,13 +358,6 @@ def _map_table(groups: Groups, value: str) -> DataFrame:
     if converged in table and value != converged:
         table["failed"] |= table[converged] < 0.5
     return table
-
-
-def _failure_name(failures: DataFrame, value: str) -> str:
-    """Say what happened where a map is grey, and at how many points; "" where it is nowhere."""
-    converges = f"{value.partition('.')[0]}.converged" in failures or "time" in value
-    word = "diverged" if (failures["finite"] < 1.0).all() else "not converged" if converges else "undefined"
-    return f"{word} ({len(failures)} points)" if len(failures) else ""
 
 
 def drawn_values(part: DataFrame, value: str) -> Series:
@@ -353,20 +407,19 @@ def best_gains(runs: DataFrame) -> BestGains | None:
 
 def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], str]:
     groups = Groups(rows, [*filter(None, (spec.facet, spec.series, spec.x))], config.axis_paths)
-    metric = spec.value
+    metric, is_share = spec.value, is_boolean(spec.value)
     column = partial(drawn_values, value=metric)
     spread = groups.spread(column)
     band, drawn = "", []
     scale = colour_scale(spread.to_numpy(), value_label(metric), spec.scale)
-    middle = "mean" if is_boolean(metric) else "median"
     for facet, part in _split(groups.means({"mean": column}).join(spread).reset_index(), spec.facet):
         parts = []
         for (value, line), colour in zip(_split(part, spec.series), cycle(COLOURS), strict=False):
             x, name = line[spec.x], with_value(config, spec.series, value)
-            if (line["rows"] > 1).any() and not is_boolean(metric):
+            if (line["rows"] > 1).any() and not is_share:
                 band = "; band: least to largest"
                 parts.append(Band(x, line["least"], line["largest"], "", colour, 0.18))
-            parts.append(Line(x, line[middle], name, colour, marker="o", size=3.5))
+            parts.append(Line(x, line["mean" if is_share else "median"], name, colour, marker="o", size=3.5))
         x, _ = axis_of(config, spec.x, np.unique(part[spec.x].to_numpy(float)))
         drawn.append(Panel(x, Axis(scale.label, metric, scale.log), parts, with_value(config, spec.facet, facet)))
     return drawn, f"{_where(config, spec)}{_over(config, groups.varied, spec)}{band}."
@@ -375,10 +428,10 @@ def _lines(config: Config, rows: Rows, spec: FigureTable) -> tuple[list[Panel], 
 def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Panel], str]:
     """Points of lines that theory gives a slope for, with the lines fitted; a line without a law has its name."""
     panels = []
-    for facet in dict.fromkeys(law.where.get(spec.facet) for law in laws):
-        parts, members = [], [law for law in laws if law.where.get(spec.facet) == facet]
+    for facet, members in groupby(laws, lambda law: law.where.get(spec.facet)):
+        parts, places = [], []
         for law, colour in zip(members, cycle(COLOURS), strict=False):
-            lead = "".join(f"{_text(value)}: " for value in law.series.values())
+            lead = "".join(f"{value_text(value)}: " for value in law.series.values())
             slope, x, y, fit = "no law", [], [], law.fit
             if fit is not None:
                 slope, x = slope_text(fit), law.x_values[[fit.first, fit.last]]
@@ -388,10 +441,10 @@ def _laws(config: Config, spec: FigureTable, laws: list[Law]) -> tuple[list[Pane
                 Line(law.x_values, errors, colour=colour, width=0.0, marker="o", size=3.5),
                 Line(x, y, lead + slope, colour),
             ]
-        x, _ = axis_of(config, spec.x, np.unique(np.concatenate([law.x_values for law in members])), log=True)
-        panels.append(
-            Panel(x, Axis(value_label(spec.value), spec.value, True), parts, with_value(config, spec.facet, facet))
-        )
+            places.append(law.x_values)
+        x, _ = axis_of(config, spec.x, np.unique(np.concatenate(places)), log=True)
+        y = Axis(value_label(spec.value), spec.value, log=True)
+        panels.append(Panel(x, y, parts, with_value(config, spec.facet, facet)))
     seeds = config.sweep.seeds
     return panels, (
         f"{_where(config, spec)}; geometric mean over {seeds} seed{'s' * (seeds != 1)}. Lines with their slopes: least "

@@ -9,9 +9,8 @@ from small_study import ALPHA, LAMBDA, NOISE, listed_axis, rigid_study, spaced_a
 
 from jaxbl.config import read_config
 from jaxbl.report.drawing import save
-from jaxbl.report.maps import draw
+from jaxbl.report.maps import Filling, draw
 from jaxbl.report.panels import Line, Map
-from jaxbl.report.refined_maps import Filling
 from jaxbl.report.results import describe
 from jaxbl.sweeps.metrics import metric_columns
 from jaxbl.sweeps.points import Points
