@@ -55,7 +55,9 @@ def describe(summary: JsonObject) -> Result:
         number_table("Parameters of the model", read_quantities(summary["parameters"])),
     ]
     title = summary["title"] or f"Diagnosis of {Path(summary['file']).name}"
-    details = [_held_out_sentence(summary["gap"]["holdout"]), *_remarks(summary)]
+    where = summary["where"] if summary["verdict"] != "unknown_effect" or summary["findings"] else {}
+    residuals = (f"Residual of the model as given: {side['sentence']}." for side in where.values())
+    details = [_held_out_sentence(summary["gap"]["holdout"]), *residuals, *summary["notes"]]
     return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), _reasons(summary), details, tables))
 
 
@@ -81,11 +83,10 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
             KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"),
         ]
     elif summary.get("numbers_off"):
-        numbers = read_quantities(summary["parameters"])
-        changes = {path: abs(np.log(number.factor)) for path, number in numbers.items() if number.factor > 0.0}
-        if changes:
-            path = max(changes, key=changes.__getitem__)
-            figures.append(KeyFigure(str(numbers[path]), f"{path}, {numbers[path].nominal:g} in the model: furthest off"))
+        numbers = {path: number for path, number in read_quantities(summary["parameters"]).items() if number.factor > 0.0}
+        if numbers:
+            path, number = max(numbers.items(), key=lambda named: abs(np.log(named[1].factor)))
+            figures.append(KeyFigure(str(number), f"{path}, {number.nominal:g} in the model: furthest off"))
     return figures
 
 
@@ -141,8 +142,10 @@ _AS_WELL = "predicts new data as well as noise and the stated uncertainties allo
 
 def _verdict(summary: JsonObject) -> tuple[str, str]:
     """The verdict and the answer in one sentence."""
-    names, verdict = _names(summary), summary["verdict"]
-    them = "it" if len(summary["findings"]) == 1 else "them"
+    findings, verdict = sorted(summary["findings"], key=lambda finding: not finding["likely"]), summary["verdict"]
+    # what may as well be something unknown is there perhaps
+    names = _join_words([f"{'' if finding['likely'] else 'perhaps '}{finding['effect']}" for finding in findings])
+    them = "it" if len(findings) == 1 else "them"
     if summary["contradictions"]:
         return "no answer", "The logs contradict each other: one model cannot hold for all of them."
     if summary.get("numbers_off"):
@@ -177,14 +180,12 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
 
 def _record_lines(summary: JsonObject) -> Lines:
     """Say where something is left, or what to record where the proof could not test the model."""
+    gap = summary["gap"]
     if summary["verdict"] == "unknown_effect":
         where = summary.get("where_after", summary["where"])
         return [f"What is left: {'; '.join(side['sentence'] for side in where.values())}."]
-    return [_what_to_record(summary)] if summary["verdict"] == "not_tested" else []
-
-
-def _what_to_record(summary: JsonObject) -> str:
-    gap = summary["gap"]
+    if summary["verdict"] != "not_tested":
+        return []
     units = gap["units"]
     effects = {name: torque for name, torque in gap["test"]["untested"].items() if torque}
     torques = [
@@ -196,15 +197,14 @@ def _what_to_record(summary: JsonObject) -> str:
         lead = f"The held-out data would pass without it, too ({'; '.join(torques)})."
         # it acts there, but less than a complete model may leave
         if all(torque["torque"] > ACTS * torque["on_log"] for torque in effects.values()):
-            return (
-                f"{lead} Hold out a motion in which it is a larger part of the torque, or one that is read with less noise."
-            )
+            way = "a motion in which it is a larger part of the torque, or one that is read with less noise"
+            return [f"{lead} Hold out {way}."]
     reached = ", ".join(
         f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
         f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
         for name, reach in gap["range"].items()
     )
-    return f"{lead} Hold out a log that reaches as far: {reached}."
+    return [f"{lead} Hold out a log that reaches as far: {reached}."]
 
 
 def _table_lines(summary: JsonObject) -> Lines:
@@ -220,12 +220,6 @@ def _table_lines(summary: JsonObject) -> Lines:
     return [f"Not named, but in model.toml as tables: {_join_words(torques)}{than}."]
 
 
-def _names(summary: JsonObject) -> str:
-    """Names of the effects that were found, as in a sentence; what may as well be something unknown is there perhaps."""
-    findings = sorted(summary["findings"], key=lambda finding: not finding["likely"])
-    return _join_words([finding["effect"] if finding["likely"] else f"perhaps {finding['effect']}" for finding in findings])
-
-
 def _join_words(words: Sequence[str]) -> str:
     """Join words as in a sentence: a, b and c."""
     return ", ".join([*words[:-2], " and ".join(words[-2:])])
@@ -233,15 +227,16 @@ def _join_words(words: Sequence[str]) -> str:
 
 def _failed_checks(summary: JsonObject) -> Lines:
     """Say why a model does not count as complete, one line each."""
-    gap, test, lines = summary["gap"], summary["gap"]["test"], []
-    if test["failed"]:
-        over = [
-            f"{name} {rms_text(value)} {gap['units'][name.partition(' ')[0]]} (at most {rms_text(limit)})"
-            for name, value, limit in _plainest(gap)
-        ]
+    gap, test, lines, over = summary["gap"], summary["gap"]["test"], [], {}
+    left = {name: (after, limit) for name, (_, after, _, limit) in _errors_of_channels(gap).items()}
+    # of each channel the test that shows it best
+    for name in sorted(test["failed"], key=lambda name: -_ratio(*left[name])):
+        channel, (error, limit) = name.split()[0], map(rms_text, left[name])
+        over.setdefault(channel, f"{name} {error} {gap['units'][channel]} (at most {limit})")
+    if over:
         lines.append(
             "More is left than noise, the uncertainty of the numbers and torques too small to be named account for "
-            f"({100.0 * test['level']:.0f} % test): {'; '.join(over)}."
+            f"({100.0 * test['level']:.0f} % test): {'; '.join(over.values())}."
         )
     for path, z in test["far"].items():
         number = Quantity.read(summary["parameters"][path])
@@ -251,15 +246,6 @@ def _failed_checks(summary: JsonObject) -> Lines:
             "offset each other. Check the noise of u, or raise [uncertainty] relative."
         )
     return [*lines, f"{CHECKS['little']}."] if test["little"] else lines
-
-
-def _plainest(gap: JsonObject) -> list[tuple[str, Any, Any]]:
-    """Return of each channel the failed test that shows it best, its error and limit."""
-    errors, best = _errors_of_channels(gap), {}
-    tests = [(name, errors[name][1], errors[name][3]) for name in gap["test"]["failed"]]
-    for test in sorted(tests, key=lambda test: -_ratio(*test[1:])):
-        best.setdefault(test[0].split()[0], test)
-    return [*best.values()]
 
 
 def probability(value: float) -> str:
@@ -278,11 +264,6 @@ def _held_out_sentence(holdout: JsonObject) -> str:
 def rms_text(value: float | None) -> str:
     """An rms value in text; None is a run that diverged."""
     return "diverges" if value is None else f"{value:.3g}"
-
-
-def _remarks(summary: JsonObject) -> Lines:
-    where = summary["where"] if summary["verdict"] != "unknown_effect" or summary["findings"] else {}
-    return [*(f"Residual of the model as given: {side['sentence']}." for side in where.values()), *summary["notes"]]
 
 
 def _ratio(error: float | None, other: float | None) -> float:

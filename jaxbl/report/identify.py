@@ -53,14 +53,16 @@ def describe(summary: JsonObject) -> Result:
     elif not all(map(is_noise, summary["residual"].values())):
         verdict = "doubtful"
         headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
-    heading = "Parameters of a fit that leaves more than noise" if summary.get("rejected") else "Parameters"
+    heading, rejected = "Parameters", summary.get("rejected")
     profiles = {path: number.get("profile_interval") for path, number in summary["parameters"].items()}
     remarks = [*summary["warnings"], *_far_off(parameters)]
-    if lacks := (summary.get("rejected") or {}).get("lacks"):
-        remarks.append(
-            f"{percent(lacks['share'])} of the torque left over on the {lacks['equation']} goes with its "
-            f"{lacks['channel']}: an effect is missing."
-        )
+    if rejected:
+        heading = "Parameters of a fit that leaves more than noise"
+        if lacks := rejected["lacks"]:
+            remarks.append(
+                f"{percent(lacks['share'])} of the torque left over on the {lacks['equation']} goes with its "
+                f"{lacks['channel']}: an effect is missing."
+            )
     remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
     title = summary["title"] or f"Identification from {Path(summary['file']).name}"
     figures = [*_backlash(summary), *number_figures(numbers)][:4]
@@ -106,11 +108,13 @@ def _remarks(summary: JsonObject) -> Lines:
         f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
         f"{fit['starts']} starts agree."
     )
+    residuals, meanings = summary["residual"].items(), ["the model is incomplete", "noise alone"]
     if "backlash" in summary:
         how = "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
+        meanings[0] = "noise of the torque, or something that the model lacks"
     lines += [
         summary["held"] and f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.",
-        *_describe_residuals(summary),
+        *(f"{side}: position residual {_size(residual)}: {meanings[is_noise(residual)]}." for side, residual in residuals),
         how,
         not fit["converged"] and "The fit stopped before it reached its tolerance.",
         summary["torque"] and f"Torque error of the model, rms: {_shares(summary['torque'])}.",
@@ -126,18 +130,6 @@ def _remarks(summary: JsonObject) -> Lines:
     if "holdout" in summary:
         lines += _on_holdout(summary["holdout"])
     return [*filter(None, lines), *summary["notes"]]
-
-
-def _describe_residuals(summary: JsonObject) -> Lines:
-    """For each side, whether no more than noise is left of its positions."""
-    meanings = [
-        "noise of the torque, or something that the model lacks" if "backlash" in summary else "the model is incomplete",
-        "noise alone",
-    ]
-    return [
-        f"{side}: position residual {_size(residual)}: {meanings[is_noise(residual)]}."
-        for side, residual in summary["residual"].items()
-    ]
 
 
 def _size(residual: JsonObject) -> str:
@@ -252,24 +244,20 @@ def _residuals(result: Identification) -> Figure:
     )
 
 
-def _mean_over(twist: Array, torque: Array, span: Pair) -> tuple[Array, Array]:
-    """Mean torque in bins of twist; NaN in bins of fewer than four samples."""
-    bins = int(np.clip(len(twist) // 15, 24, 80))
-    count, edges = np.histogram(twist, bins, span)
-    total, _ = np.histogram(twist, bins, span, weights=torque)
-    return 0.5 * (edges[1:] + edges[:-1]), np.where(count >= 4, total / np.maximum(count, 1), np.nan)
-
-
 def _means(log: LogSignals, x: Array, torque: Array, rate: Array, name: str, span: Pair | None) -> list[Line]:
-    """Settled samples of a torque over x, as far as it goes, and their means for both signs of its rate."""
+    """Settled samples of a torque over x, as far as it goes, and their means for both signs of its rate, in bins of at least
+    four samples."""
     if span is None:
         return []
     x, torque, rate = (signal[log.settled] for signal in (x, torque, rate))
-    finite, grows = np.isfinite(torque), rate > 0.0
-    return [cloud(x, torque)] + [
-        Line(*_mean_over(x[chosen], torque[chosen], span), f"mean, {name} {word}", colour, 2.4, opacity=0.9)
-        for word, colour, chosen in (("growing", GREEN, finite & grows), ("falling", PURPLE, finite & ~grows))
-    ]
+    lines, finite, grows = [cloud(x, torque)], np.isfinite(torque), rate > 0.0
+    for word, colour, rows in (("growing", GREEN, finite & grows), ("falling", PURPLE, finite & ~grows)):
+        bins = int(np.clip(np.sum(rows) // 15, 24, 80))
+        count, edges = np.histogram(x[rows], bins, span)
+        total, _ = np.histogram(x[rows], bins, span, weights=torque[rows])
+        mean = np.where(count >= 4, total / np.maximum(count, 1), np.nan)
+        lines.append(Line(0.5 * (edges[1:] + edges[:-1]), mean, f"mean, {name} {word}", colour, 2.4, opacity=0.9))
+    return lines
 
 
 def _hysteresis(log: LogSignals) -> Figure:

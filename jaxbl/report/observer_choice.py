@@ -228,26 +228,25 @@ def choice_headline(summary: JsonObject) -> Lines:
 
 
 def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
-    points, kinds = summary["points"], summary["observers"]
-    tables = []
-    if len(points) == 1:
-        for side, result in points[0]["sides"].items():
+    """A table for each side: of a single point all kinds with their gains, else the ratios at each point."""
+    points, kinds, axes, tables = summary["points"], summary["observers"], summary["axes"], []
+    for side, first in points[0]["sides"].items():
+        if len(points) == 1:
+            heading = side
+            columns = ["observer", error_label(summary), "worst run", "times the best", "from", "to", "gains"]
             rows = [
                 [kind, *(numbers[key] for key in ("error", "worst", *_RATIO)),
                  ", ".join(f"{key} = {value:.4g}" for key, value in numbers["gains"].items())]
-                for kind, numbers in result["kinds"].items()
+                for kind, numbers in first["kinds"].items()
             ]  # fmt: skip
-            columns = ["observer", error_label(summary), "worst run", "times the best", "from", "to", "gains"]
-            tables.append(ResultTable(f"{side}, {_where(summary)}", columns, rows))
-        return tables
-    axes = summary["axes"]
-    for side in points[0]["sides"]:
-        rows = [
-            [*(point["values"][path] for path in axes), result["best"] or "none", ", ".join(result["not_told_apart"]),
-             *(_ratio(result["kinds"][kind]) for kind in kinds)]
-            for point in points
-            for result in [point["sides"][side]]
-        ]  # fmt: skip
-        columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
-        tables.append(ResultTable(f"{side}: times the best one's error (95 % interval), {_where(summary)}", columns, rows))
+        else:
+            heading = f"{side}: times the best one's error (95 % interval)"
+            columns = [*(axis_label(config, path) for path in axes), "best", "not told apart", *kinds]
+            rows = [
+                [*(point["values"][path] for path in axes), result["best"] or "none", ", ".join(result["not_told_apart"]),
+                 *(_ratio(result["kinds"][kind]) for kind in kinds)]
+                for point in points
+                for result in [point["sides"][side]]
+            ]  # fmt: skip
+        tables.append(ResultTable(f"{heading}, {_where(summary)}", columns, rows))
     return tables

@@ -205,19 +205,6 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
     return f"The study does not ask what converges. In {runs}, {extents[0]}."
 
 
-def _explain_ends(law: Law) -> str:
-    """Why a law ends below and above; the end of the sweep is named only where both ends are that."""
-    if law.stops["below"] == law.stops["above"]:
-        return law.stops["below"]
-    return "; ".join(f"{end}: {law.stops[end]}" for end in ("below", "above") if law.stops[end] != END_OF_SWEEP)
-
-
-def _place(law: Law) -> str:
-    """The values that a line of a law is for; a word stands without its path."""
-    pairs = (law.series | law.where).items()
-    return ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in pairs) or "all points"
-
-
 def _law_table(laws: list[Law]) -> ResultTable:
     rows = []
     for law in laws:
@@ -226,7 +213,13 @@ def _law_table(laws: list[Law]) -> ResultTable:
             halves = f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
             texts = slope_text(law.fit), halves, f"{law.range[0]:g} to {law.range[1]:g} ({law.in_range.sum()})"
         slope, halves, ends = (text.replace(" ", "\u00a0") for text in texts)
-        line = f"{law.value} over {law.x}"
-        rows.append([line, _place(law), law.theory, slope, halves, law.agrees, ends, _explain_ends(law)])
+        # a word stands without its path
+        values = (law.series | law.where).items()
+        where = ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in values)
+        why = law.stops["below"]
+        if why != law.stops["above"]:
+            # the end of the sweep is named only where both ends are that
+            why = "; ".join(f"{end}: {stop}" for end, stop in law.stops.items() if stop != END_OF_SWEEP)
+        rows.append([f"{law.value} over {law.x}", where or "all points", law.theory, slope, halves, law.agrees, ends, why])
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return ResultTable("Accuracy laws", columns, rows)
