@@ -1,10 +1,12 @@
-"""What `jaxbl tune` leaves to be read: the objective over the gains, what limits them, comparisons."""
+"""What `jaxbl tune` leaves to be read: the objective over the gains, what limits them, comparisons, certificates."""
 
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 
+from jaxbl.files import write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
@@ -13,7 +15,6 @@ from jaxbl.lines import Lines, doubts_among, percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
-from .certificate import certificate_lines, certificate_tables, is_refuted, write_certificates
 from .gain_plane import (
     EXACT,
     RESERVE_WORDS,
@@ -99,9 +100,12 @@ def _way(symbol: str, unit: str, way: JsonObject) -> str:
 
 
 def write(tuning: Tuning, folder: Path) -> None:
-    """Write `gains.toml` and certificates."""
-    write_certificates(tuning.summary, folder)
-    (folder / "gains.toml").write_text(gains_toml(tuning.summary), encoding="utf-8")
+    """Write `gains.toml`, and `certificate.json` of the sides of which something is proven, if there is one."""
+    summary = tuning.summary
+    if proven := _proven(summary):
+        data = {"title": summary["title"], "observer": "super_twisting", "assumptions": ASSUMPTIONS, "sides": proven}
+        write_json(folder / "certificate.json", data)
+    (folder / "gains.toml").write_text(gains_toml(summary), encoding="utf-8")
 
 
 def describe(tuning: Tuning) -> Result:
@@ -124,7 +128,8 @@ def describe(tuning: Tuning) -> Result:
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
     doubts = doubts_among(summary["remarks"])
     remarks = [*doubts, *_reasons(summary), *certified]
-    if is_refuted(summary):
+    if any(proof.get("search", {}).get("violations") for proof in summary.get("certificates", {}).values()):
+        # before all else
         verdict, headline = "failed", "The search found an error above what was proven."
         remarks = [*certified, *doubts, *_reasons(summary)]
     details, holdout = [line for line in summary["remarks"] if line not in doubts], summary["holdout"]
@@ -256,3 +261,69 @@ def _comparison_table(heading: str, gains: list[JsonObject]) -> ResultTable:
     columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
                "median", "convergence (s)", *_MARGINS]  # fmt: skip
     return ResultTable(heading, columns, rows)
+
+
+ASSUMPTIONS = (
+    "The acceleration of the shaft less the nominal one that the observer takes for a period (unknown torque over inertia, "
+    "and what friction makes of the velocity error) stays within ±f_plus at all times; it may change at any time.",
+    "The error of each reading, with its rounding to counts, stays within ±noise.",
+    "The sampling period is fixed, and arithmetic is exact.",
+    "At the first sample the errors are at most position_error and velocity_error.",
+    "With the explicit discretisation the nominal acceleration stays within ±acceleration.",
+    "It is about the velocity that the super-twisting observer estimates, not about the torque behind the low-pass.",
+)
+"""Of every certificate, in words; the numbers are beside them."""
+
+
+def _proven(summary: JsonObject) -> JsonObject:
+    """Certificates of the sides of which something is proven."""
+    return {side: proof for side, proof in summary.get("certificates", {}).items() if proof["certified"]}
+
+
+def certificate_lines(summary: JsonObject) -> Lines:
+    """The certificates in sentences."""
+    certificates = summary.get("certificates", {}).items()
+    return [line for side, proof in certificates for line in _certificate_lines(side, proof, summary["passed_over"][side])]
+
+
+def _above(value: float, rounding: str = ROUND_CEILING) -> float:
+    """Rounded up to four digits (to rounding errors): what is printed as proven must not say more than the proof."""
+    return float(Context(4, rounding).create_decimal(f"{value:.12g}"))
+
+
+def _certificate_lines(side: str, proof: JsonObject, passed_over: int) -> Lines:
+    """What is promised of a side, what was tried, and whether that is what was asked for."""
+    if not proof["certified"]:
+        return [f"{side}: no certificate: {proof['why_none']}."]
+    # what is assumed is rounded down
+    bounds = {name: _above(value, ROUND_FLOOR) for name, value in proof["assumptions"].items() if name != "discretisation"}
+    search = proof["search"]
+    nominal = f", nominal acceleration of {bounds['acceleration']:.4g} rad/s²" if "acceleration" in bounds else ""
+    promise = f"{_above(proof['accuracy']):.4g} rad/s"
+    period = f"{proof['assumptions']['period']:.4g} s"
+    lines = [
+        f"{side}, promised: a velocity error of at most {promise} from {_above(proof['reaching_time']):.4g} s on, proven "
+        f"(with {_above(proof['final_accuracy']):.4g} rad/s from {_above(proof['curve']['time'][-1]):.4g} s on) for any "
+        f"noise within ±{bounds['noise']:.4g} rad and any missing acceleration within ±{bounds['f_plus']:.4g} rad/s²"
+        f"{nominal}, sampled every {period}, from errors of {bounds['velocity_error']:.4g} rad/s "
+        f"and {bounds['position_error']:.4g} rad.",
+        f"{side}, tried: the worst of {search['runs']} adversarial runs errs by {search['worst']:.3g} rad/s. Another search "
+        f"may find more, but not more than the {promise} that are promised.",
+    ]
+    missed = [
+        f"{name.replace('_', ' ')} {limit['asked']:.3g} {'s' if name == 'reaching_time' else 'rad/s'}"
+        for name, limit in proof["limits"].items()
+        if not limit["met"]
+    ]
+    if missed:
+        lines.insert(0, f"{side}, certificate: what was asked for is not proven: {', '.join(missed)}.")
+    elif proof["limits"]:
+        gains = f"; {passed_over} gains with less error in the runs do not" if passed_over else ""
+        lines.append(f"{side}, certificate: the gains keep what was asked for{gains}.")
+    return lines
+
+
+def certificate_tables(summary: JsonObject) -> list[ResultTable]:
+    """A table of what the certificates assume, if there are any."""
+    assumptions = [[line] for line in ASSUMPTIONS]
+    return [ResultTable("What the certificates assume", ["assumption"], assumptions)] if _proven(summary) else []

@@ -18,8 +18,8 @@ from jaxbl.errors import InputError, NoResult
 from jaxbl.gains import adversary, certificate
 from jaxbl.gains.certificate import certify
 from jaxbl.gains.tune import tune
-from jaxbl.report.certificate import certificate_lines, certificate_tables
 from jaxbl.report.results import write_report
+from jaxbl.report.tune import certificate_lines, certificate_tables
 
 GAINS = 2.2, 9.2
 BOUNDS = {"noise": 5e-5, "f_plus": 5.0, "period": 1e-3, "velocity_error": 0.1, "runs": 1}

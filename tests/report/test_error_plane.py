@@ -5,7 +5,7 @@ import pytest
 from panel_parts import names_of
 from small_study import small_study
 
-from jaxbl.report.error_plane import error_plane
+from jaxbl.report.simulate import error_plane
 from jaxbl.sweeps.trial import run
 
 

@@ -15,9 +15,9 @@ from jaxbl.errors import InputError
 from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.report.checks import has_words
-from jaxbl.report.error_plane import error_path
 from jaxbl.report.maps import axis_words, value_label
 from jaxbl.report.panels import MAP, pack_numbers
+from jaxbl.report.simulate import error_path
 from jaxbl.report.sweep import answer_sweep
 from jaxbl.sweeps.metrics import is_magnitude
 from jaxbl.sweeps.store import Store, identity
