@@ -8,6 +8,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -94,12 +95,11 @@ class Item(NamedTuple):
         Raises:
             InputError: no number, a unit that is not known here, or out of range.
         """
-        units_by_spelling = {_normalise_unit(unit): (unit, factor) for unit, factor in self.units.items()}
-        example = f"'{self.example}'" + (f", or '{NONE}'" if self.absent else "")
         if self.absent and text.strip().lower() == NONE:
             return Answer(0.0, f"given: {NONE}")
+        units_by_spelling = {_normalise_unit(unit): (unit, factor) for unit, factor in self.units.items()}
+        example = f"'{self.example}'" + (f", or '{NONE}'" if self.absent else "")
         match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
-        units = ", ".join(unit for unit in self.units if unit) or "none"
         if not match or match[2].startswith(","):
             point = ", with a decimal point" if "," in text else ""
             raise InputError(f"{self.option} '{text}': should be a number and its unit{point}, such as {example}")
@@ -107,18 +107,17 @@ class Item(NamedTuple):
         if not unit and not number:
             # zero of anything
             unit = next(iter(units_by_spelling))
-        if not unit and "" not in units_by_spelling:
-            raise InputError(f"{self.option} '{text}': has no unit; such as {example}; units: {units}")
         if unit not in units_by_spelling:
-            raise InputError(f"{self.option} '{text}': the unit '{match[2]}' is not known here; known: {units}")
+            known = ", ".join(filter(None, self.units)) or "none"
+            fault = f"the unit '{match[2]}' is not known here; known" if unit else f"has no unit; such as {example}; units"
+            raise InputError(f"{self.option} '{text}': {fault}: {known}")
         name, factor = units_by_spelling[unit]
         try:
             value = factor(number) if callable(factor) else factor * number
         except (ZeroDivisionError, OverflowError):
             value = math.nan
         if not (0.0 < value < 1e30 or (value == 0.0 and not self.is_above)):
-            unit = f" {next(iter(self.units))}".rstrip()
-            limit = f"{'more than' if self.is_above else 'at least'} 0{unit}"
+            limit = f"{'more than' if self.is_above else 'at least'} 0 {next(iter(self.units))}".rstrip()
             raise InputError(f"{self.option} '{text}': should be {limit}, such as '{self.example}'")
         return Answer(value, f"given: {match[1]} {name}".rstrip())
 
@@ -143,6 +142,10 @@ class Answer(NamedTuple):
 
     value: float
     text: str
+
+    def write(self, key: str, unit: str = "", factor: float = 1.0, how: str = "") -> str:
+        """Write a key of a study: `factor` times this number, its unit, and what it follows from; `how` says by what."""
+        return f"{key} = {_round(factor * self.value)} # {unit}{', ' * bool(unit)}{self.text}{how}"
 
 
 Answers = Mapping[str, Answer]
@@ -306,7 +309,9 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
     from .gains.machine_study import propose_map, propose_tolerances
     from .gains.pilot import Scenarios, list_scenarios, run_pilot
 
-    answers, table = rename_to_geared(kind, answers), TuneTable(worst_over_uncertainty=True)
+    # by the names that they have on a geared drive
+    answers = {item.key or item.name: answers[item.name] for item in kind.items}
+    table = TuneTable(worst_over_uncertainty=True)
     try:
         data = tomllib.loads(_write_drive(kind, answers, title, _choose_amplitude(answers, _HARMONICS)))
         amplitude, pilot_metrics = _limit_input(data, answers, table)
@@ -348,7 +353,7 @@ def _limit_input(data: JsonObject, answers: Answers, table: "TuneTable") -> tupl
     peak = float(np.abs(jax.vmap(model.excitation.build())(times)).max())
     amplitude = data["excitation"]["amplitude"] * min(answers["torque"].value / peak, 1.0)
     while True:
-        amplitude = float(_format_number(0.995 * amplitude, 3))  # rounded, it is not larger
+        amplitude = _round(0.995 * amplitude, 3)  # rounded, it is not larger
         pilot_metrics = run_pilot(list_scenarios(model.with_keys("excitation", amplitude=amplitude), table), table)
         speed = pilot_metrics["motor"]["largest_velocity"]
         if speed <= rated:
@@ -362,7 +367,7 @@ def _make_chirp(answers: Answers, amplitude: float) -> JsonObject:
     """Make the input that gains are compared on."""
     frequency = answers["frequency"].value
     ends = {"start_frequency": frequency, "stop_frequency": 4.0 * frequency, "sweep_time": _PERIODS / frequency}
-    return {"kind": "chirp", "amplitude": amplitude} | {name: float(_format_number(end)) for name, end in ends.items()}
+    return {"kind": "chirp", "amplitude": amplitude} | {name: _round(end) for name, end in ends.items()}
 
 
 def _check_motion(kind: DriveKind, pilot_metrics: JsonObject) -> None:
@@ -376,91 +381,76 @@ def _check_motion(kind: DriveKind, pilot_metrics: JsonObject) -> None:
         raise InputError(f"the load does not move: {options['backlash']} should be smaller, or {options['frequency']} lower")
 
 
-def rename_to_geared(kind: DriveKind, answers: Answers) -> dict[str, Answer]:
-    """Return the answers by the names that they have on a geared drive."""
-    return {item.key or item.name: answers[item.name] for item in kind.items}
-
-
-def _format_number(value: float, digits: int = 6) -> str:
-    return repr(float(f"{value:.{digits}g}"))
+def _round(value: float, digits: int = 6) -> float:
+    return float(f"{value:.{digits}g}")
 
 
 def _write_drive(kind: DriveKind, answers: Answers, title: str, amplitude: float) -> str:
-    """The tables of the drive, its input and its sensors; numbers are :func:`rename_to_geared`."""
+    """The tables of the drive, its input and its sensors; `answers` have the names of a geared drive."""
     import tomli_w
 
     from .drive.effects import CoulombFriction, Damping
     from .records import NominalDrive
     from .records.proposal import count_plant_steps
 
-    value = {name: answer.value for name, answer in answers.items()}
-
-    def line(key: str, name: str, unit: str = "", factor: float = 1.0, how: str = "") -> str:
-        """Write a key with its SI value, unit, and the answer that it follows from."""
-        return f"{key} = {_format_number(factor * value[name])} # {unit}{', ' * bool(unit)}{answers[name].text}{how}"
-
-    def numbers(side: str, where: str = "") -> list[str]:
-        units = (("inertia", "kg m²"), ("viscous", "N m s/rad"))
-        return [line(f"{side}_{key}", f"{side}_{key}", kind.unit(side, unit) + where) for key, unit in units]
-
     angle, torque = kind.unit("motor", "rad"), kind.unit("motor", "N m")
     rated = "torque" if torque == "N m" else "force"
     limits = ", and ".join(answers[name].text.removeprefix("given: ") for name in ("torque", "speed"))
-    lines = [
-        "# Written by jaxbl init from a data sheet. All numbers are in SI units; behind each stands what was given.",
-        "# All keys: docs/reference.md, and 'jaxbl schema' for editors that complete them.",
-        tomli_w.dumps({"title": title} | ({"notes": notes} if (notes := _write_notes(kind, answers)) else {})).strip(),
-        "",
-        "[drive]",
-        f'kind = "{"two_inertia" if kind.law else "rigid"}"',
-        *numbers("motor"),
-        *(_write_transmission(kind, answers, numbers, line) if kind.law else []),
-    ]
-    if value["motor_friction"]:
-        lines += ["", "[[effects]]", f'kind = "motor.{CoulombFriction.kind}"', line("torque", "motor_friction", torque)]
-    noise, load = "", []
+    notes = _write_notes(kind, answers)
+    nominal = NominalDrive(answers["motor_inertia"].value, answers["motor_viscous"].value)
+    gear = friction = damping = noise = load = ""
+    if answers["motor_friction"].value:
+        friction = f"""
+[[effects]]
+kind = "motor.{CoulombFriction.kind}"
+{answers["motor_friction"].write("torque", torque)}
+"""
     if kind.law:
-        ratio = value["gear_ratio"]
-        to_stiffness, to_half_gap = _to_motor(ratio)
-        stiffness, half_gap = to_stiffness * value["stiffness"], to_half_gap * value["backlash"]
-        inertias = value["motor_inertia"], value["load_inertia"] / ratio**2
-        shaft = 2.0 * math.sqrt(stiffness * math.prod(inertias) / sum(inertias))
-        if value["damping"]:
+        ratio = answers["gear_ratio"].value
+        stiffness = ratio**-2 * answers["stiffness"].value
+        nominal = replace(nominal, load_inertia=answers["load_inertia"].value, gear_ratio=ratio, stiffness=stiffness)
+        gear = _write_transmission(kind, answers)
+        if answers["damping"].value:
+            inertias = answers["motor_inertia"].value, answers["load_inertia"].value / ratio**2
+            shaft = 2.0 * math.sqrt(stiffness * math.prod(inertias) / sum(inertias))
             how = " of the oscillation of both inertias"
-            damping = line("damping", "damping", "N m s/rad on the motor's shaft", shaft, how)
-            lines += ["", "[[effects]]", f'kind = "transmission.{Damping.kind}"', damping]
+            damping = f"""
+[[effects]]
+kind = "transmission.{Damping.kind}"
+{answers["damping"].write("damping", "N m s/rad on the motor's shaft", shaft, how)}
+"""
         noise = " (the load's is this divided by the gear ratio; load_noise says otherwise)"
-        load = [line("load_resolution", "load_encoder", f"{kind.unit('load', 'rad')} a count, 0 is ideal")]
-        load_numbers = value["load_inertia"], value["load_viscous"]
-        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"], *load_numbers, ratio, stiffness, half_gap)
-    else:
-        nominal = NominalDrive(value["motor_inertia"], value["motor_viscous"])
-    inputs = f"""
+        load = answers["load_encoder"].write("load_resolution", f"{kind.unit('load', 'rad')} a count, 0 is ideal") + "\n"
+    substeps = count_plant_steps(nominal, answers["sample_period"].value)
+    return f"""\
+# Written by jaxbl init from a data sheet. All numbers are in SI units; behind each stands what was given.
+# All keys: docs/reference.md, and 'jaxbl schema' for editors that complete them.
+{tomli_w.dumps({"title": title} | ({"notes": notes} if notes else {})).strip()}
+
+[drive]
+kind = "{"two_inertia" if kind.law else "rigid"}"
+{answers["motor_inertia"].write("motor_inertia", kind.unit("motor", "kg m²"))}
+{answers["motor_viscous"].write("motor_viscous", kind.unit("motor", "N m s/rad"))}
+{gear}{friction}{damping}
 # The input: six waves at once. Replace it by a motion of your own: kind = 'recorded' plays a file back.
 [excitation]
 kind = "multisine"
-amplitude = {_format_number(amplitude, 3)} # {torque}: within the rated {rated} and speed; given: {limits}
-{line("frequency", "frequency", "Hz")}
+amplitude = {_round(amplitude, 3)} # {torque}: within the rated {rated} and speed; given: {limits}
+{answers["frequency"].write("frequency", "Hz")}
 count = {_HARMONICS}
 
 [uncertainty]
 relative = {_UNCERTAINTY} # of the numbers above: machines differ from their data sheets
 
 [encoders]
-{line("noise", "encoder_noise", f"{angle} rms", how=noise)}
-{line("motor_resolution", "motor_encoder", f"{angle} a count, 0 is ideal")}"""
-    run = f"""
+{answers["encoder_noise"].write("noise", f"{angle} rms", how=noise)}
+{answers["motor_encoder"].write("motor_resolution", f"{angle} a count, 0 is ideal")}
+{load}
 [run]
-duration = {_format_number(_PERIODS / value["frequency"])} # s: {_PERIODS} periods of the input
-{line("sample_period", "sample_period", "s")}
-substeps = {count_plant_steps(nominal, value["sample_period"])} # steps of the plant a sample, by the stiffness
+duration = {_round(_PERIODS / answers["frequency"].value)} # s: {_PERIODS} periods of the input
+{answers["sample_period"].write("sample_period", "s")}
+substeps = {substeps} # steps of the plant a sample, by the stiffness
 """
-    return "\n".join([*lines, inputs, *load, run])
-
-
-def _to_motor(ratio: float) -> tuple[float, float]:
-    """Return the factors that take stiffness and backlash at the output to stiffness and half gap on the motor shaft."""
-    return ratio**-2, 0.5 * ratio
 
 
 def _write_notes(kind: DriveKind, answers: Answers) -> list[str]:
@@ -477,30 +467,25 @@ def _write_notes(kind: DriveKind, answers: Answers) -> list[str]:
     return notes
 
 
-def _write_transmission(
-    kind: DriveKind,
-    answers: Answers,
-    write_side_numbers: Callable[..., list[str]],
-    write_line: Callable[..., str],
-) -> list[str]:
+def _write_transmission(kind: DriveKind, answers: Answers) -> str:
     """Write the rest of `[drive]`: load and gear; then `[transmission]`."""
-    ratio, gap = answers["gear_ratio"].value, answers["backlash"].value
-    stiff, half = _to_motor(ratio)
-    turning = "load" not in kind.linear
-    where_motor, where = "on the motor's shaft", "at the output" if turning else "at the carriage"
-    explanation = () if turning else ("rad of the motor for 1 m of the carriage", 1.0, " a turn")
-    lines = [
-        *write_side_numbers("load", ", at the load's shaft" if turning else ""),
-        write_line("gear_ratio", "gear_ratio", *explanation),
-        "",
-        "[transmission]",
-        'law = "dead_zone" # a hard gap' if gap else 'law = "linear_shaft" # no backlash was given',
-        write_line("stiffness", "stiffness", f"N m/rad {where_motor}", stiff, f" {where}, divided by {ratio:.6g}²"),
-    ]
-    if gap:
+    ratio, gap, half_gap = answers["gear_ratio"].value, answers["backlash"], ""
+    at_load, where, unit, turn = ", at the load's shaft", "at the output", "", ""
+    if "load" in kind.linear:
+        at_load, where, unit, turn = "", "at the carriage", "rad of the motor for 1 m of the carriage", " a turn"
+    if gap.value:
         how = f" {where}, end to end; half of it times {ratio:.6g}"
-        lines.append(write_line("half_gap", "backlash", f"rad {where_motor}", half, how))
-    return lines
+        half_gap = gap.write("half_gap", "rad on the motor's shaft", 0.5 * ratio, how) + "\n"
+    how = f" {where}, divided by {ratio:.6g}²"
+    return f"""\
+{answers["load_inertia"].write("load_inertia", kind.unit("load", "kg m²") + at_load)}
+{answers["load_viscous"].write("load_viscous", kind.unit("load", "N m s/rad") + at_load)}
+{answers["gear_ratio"].write("gear_ratio", unit, how=turn)}
+
+[transmission]
+{'law = "dead_zone" # a hard gap' if half_gap else 'law = "linear_shaft" # no backlash was given'}
+{answers["stiffness"].write("stiffness", "N m/rad on the motor's shaft", ratio**-2, how)}
+{half_gap}"""
 
 
 def _choose_amplitude(answers: Answers, waves: int) -> float:
@@ -562,7 +547,7 @@ def compare_observers(kind: DriveKind, text: str, pilot_metrics: JsonObject) -> 
     lines = [sentence]
     if best != name_of_study:
         gains = {
-            side: {key: float(_format_number(value, 3)) for key, value in summary["kinds"][best]["gains"].items()}
+            side: {key: _round(value, 3) for key, value in summary["kinds"][best]["gains"].items()}
             for side, summary in sides.items()
         }
         table = tomli_w.dumps({"observer": {"kind": best} | gains})
@@ -600,12 +585,19 @@ def _write_observers(
 
     from .gains.machine_study import TOLERANCE_FACTOR
 
-    bound = {side: float(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
     angle = kind.unit("motor", "rad")
     load = "; on the load both are divided by the gear ratio" if kind.law else ""
-    bounds = ", ".join(f"{f_plus:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, f_plus in bound.items())
+    bounds = ", ".join(
+        f"{metrics['f_plus']:.3g} {kind.unit(side, 'rad/s²')} ({side})" for side, metrics in pilot_metrics.items()
+    )
     speed = pilot_metrics["motor"]["largest_velocity"]
-    head = f"""\
+    observers = [
+        f"{side} = {{ lambda = {_round(lambda_, 3)}, alpha = {_round(alpha, 3)} }} "
+        f"# {kind.unit(side, '√rad/s')}, {kind.unit(side, 'rad/s²')}\n"
+        for side, (lambda_, alpha) in gains.items()
+    ]
+    maps = [f"[[{name}]]\n{tomli_w.dumps(table)}\n" for name, tables in gain_map.items() for table in tables]
+    return f"""\
 # Errors of the motor observer that are accepted: {TOLERANCE_FACTOR:g} times the largest that is to be expected (rms)
 # of either side with the gains below, in drives within [uncertainty]{load}. Put in what you need.
 velocity_tolerance = {tolerances["velocity_tolerance"]!r} # {angle}/s
@@ -615,12 +607,8 @@ position_tolerance = {tolerances["position_tolerance"]!r} # {angle}
 # acceleration that observers do not know, in runs of drives within [uncertainty]: {bounds}.
 # 'jaxbl tune' looks for better ones.
 # The motor's largest speed in these runs: {speed:.3g} {angle}/s; rated: {answers["speed"].value:.3g}.
-[observer]"""
-    lines = [head]
-    for side, (lambda_, alpha) in gains.items():
-        units = ", ".join(kind.unit(side, unit) for unit in ("√rad/s", "rad/s²"))
-        lines.append(f"{side} = {{ lambda = {_format_number(lambda_, 3)}, alpha = {_format_number(alpha, 3)} }} # {units}")
-    tables = f"""
+[observer]
+{"".join(observers)}
 # jaxbl tune: gains of the least error, compared on another input
 [tune]
 objective = "velocity" # or "torque"
@@ -629,8 +617,6 @@ worst_over_uncertainty = true
 [tune.holdout]
 {tomli_w.dumps(chirp).strip()}
 
-# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key."""
-    lines.append(tables)
-    lines += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, tables in gain_map.items() for table in tables]
-    lines.append(f"# {describe_expectation(kind, pilot_metrics)}")
-    return "\n".join(lines) + "\n"
+# jaxbl sweep: a map of the motor observer's gains. Any number of this file can be an axis, by its table and key.
+{"".join(maps)}# {describe_expectation(kind, pilot_metrics)}
+"""
