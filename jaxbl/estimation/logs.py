@@ -22,7 +22,6 @@ from jaxbl.drive.parameters import as_arrays, get_leaf, leaf_paths
 from jaxbl.errors import InputError
 from jaxbl.records import POSITION_CHANNELS, Record, TurningLog, check_positions, find_zero_shift, join_records, read_record
 from jaxbl.records.signal_quality import segments_before
-from jaxbl.records.table import TorqueTable
 
 from .free_parameters import PLANT_TABLES
 
@@ -146,8 +145,9 @@ def read_logs(
         separate = {"offset"} & {*corrections} | ({"skew", "drift"} if "drift" in keys else set())
         corrections = {key: (corrections if key in separate else shared).get(key, 0.0) for key in keys}
         if not isinstance(log, Record) and corrections != record.corrections:
+            corrected = config.model_copy(update={"log": config.log.with_corrections(corrections)})
             # the reader counts what [log] gives as no correction of its own
-            records[i] = replace(read(_set_corrections(config, corrections), log), corrections=corrections)
+            records[i] = replace(read(corrected, log), corrections=corrections)
     first, *following = records if like is None else (like, *records)
     following = [_from_zero_of(first, record, config, share) for record in following]
     return join_records([first, *following] if like is None else following)
@@ -233,20 +233,6 @@ def _from_zero_of(first: Record, record: Record, config: Config, share: float) -
     }
     corrections = record.corrections | {"zero": shift.value}
     return replace(record, positions=positions, warnings=(*record.warnings, warning), corrections=corrections)
-
-
-def _set_corrections(config: Config, corrections: Mapping[str, float]) -> Config:
-    """The study with skews of theta_s and u and an offset of theta_e in `[log]`, as they are given."""
-    table = config.log
-    if "u.skew" in corrections:
-        u = (table.u or TorqueTable()).model_copy(update={"skew": corrections["u.skew"]})
-        table = table.model_copy(update={"u": u, "hold": "sampled" if corrections["u.sampled"] else "zoh"})
-    for position, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
-        # a speed in place of a position has no key for some of them, and then no need
-        name, channel = table.position_source(position)
-        if key in corrections and (key != "offset" or name == position) and key in type(channel).model_fields:
-            table = table.model_copy(update={name: channel.model_copy(update={key: corrections[key]})})
-    return config.model_copy(update={"log": table})
 
 
 def _read_one(config: Config, log: str | Path | Record, seeks_delay: bool, share: float) -> Record:

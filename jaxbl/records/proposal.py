@@ -215,22 +215,24 @@ def _choose(candidates: list[_Candidate], words: set[str]) -> _Candidate:
 def _make_table(channel: str, candidate: _Candidate, guesses: list[str]) -> _Table:
     """Make the table of a channel; `guesses` say what its unit is taken to be, and what is to be put in."""
     _, column, _, unit, values = candidate
+    keys: _Table = {"column": column}
     if channel == "t":
-        return {"column": column} | ({"unit": _guess_time_unit(unit, values, guesses)} if values.dtype.kind in "iuf" else {})
+        return keys | ({"unit": _guess_time_unit(unit, values, guesses)} if values.dtype.kind in "iuf" else {})
     units = _CHANNEL_UNITS[channel.partition("_")[0]]
     if channel.startswith("theta") and not unit and np.isfinite(values).all() and (values == np.round(values)).all():
         unit = "counts"
-    keys, quantity = units.get(unit), "u" if channel == "u" else f"'{column}'"
-    if keys is None:
+    quantity = "u" if channel == "u" else f"'{column}'"
+    if unit not in units:
         assumed = next(iter(units))
         fault = f"'{unit}', which is unknown: put in factor; " if unit else "not given: "
         guesses.append(f"The unit of {quantity} is {fault}{assumed} is assumed.")
-        keys = {} if channel == "u" else units[assumed]
-    elif channel == "u" and "factor" in keys and unit != "mN m":
+        return keys if channel == "u" else keys | units[assumed]
+    keys |= units[unit]
+    if channel == "u" and "factor" in keys and unit != "mN m":
         guesses.append(f"u.factor: put in the torque of one {unit} of the column; {keys['factor']:g} N m is a placeholder.")
     elif unit == "counts":
         guesses.append(f"{quantity} looks like counts: put in counts_per_turn; 4096 is a placeholder.")
-    return {"column": column} | keys
+    return keys
 
 
 def _guess_time_unit(unit: str, values: np.ndarray, guesses: list[str]) -> str:
@@ -276,16 +278,8 @@ def propose_study(
         guesses.append("The numbers of the drive are those of the model.")
     ratio = (gear_ratio or nominal.gear_ratio) if math.isfinite(nominal.stiffness) else None
     inspection = inspect(path, table, gear_ratio=ratio, nominal=nominal)
-    corrections = inspection.record.corrections
-    for channel, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset"), ("u", "u.skew")):
-        if key in corrections:
-            name = "u" if channel == "u" else inspection.log.position_source(channel)[0]
-            channel_table = table.get(name, name)
-            if not isinstance(channel_table, dict):
-                channel_table = {"column": channel_table}
-            table[name] = channel_table | {key.removeprefix("u."): corrections[key]}
-    if corrections.get("u.sampled"):
-        table["hold"] = "sampled"
+    if corrections := inspection.record.corrections:
+        table = inspection.log.with_corrections(corrections).model_dump(exclude_unset=True, exclude_none=True)
     return _make_study(inspection, nominal, table), guesses, inspection
 
 

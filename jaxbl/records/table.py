@@ -1,6 +1,6 @@
 """The `[log]` table of a study: which columns a measured log has, and how they become SI units."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -266,6 +266,19 @@ class LogTable(StrictTable):
             if isinstance(channel, PositionTable) and channel.minus is not None:
                 columns.add(channel.minus)
         return columns
+
+    def with_corrections(self, corrections: Mapping[str, float]) -> "LogTable":
+        """Return the table with skews of theta_s and u and an offset of theta_e that were found, as keys."""
+        table = self
+        if "u.skew" in corrections:
+            u = (self.u or TorqueTable()).model_copy(update={"skew": corrections["u.skew"]})
+            table = self.model_copy(update={"u": u, "hold": "sampled" if corrections["u.sampled"] else self.hold})
+        for position, key in (("theta_s", "skew"), ("theta_s", "drift"), ("theta_e", "offset")):
+            # a speed in place of a position has no key for some of them, and then no need
+            name, channel = table.position_source(position)
+            if key in corrections and (key != "offset" or name == position) and key in type(channel).model_fields:
+                table = table.model_copy(update={name: channel.model_copy(update={key: corrections[key]})})
+        return table
 
     def position_source(self, name: str) -> tuple[str, PositionTable | SpeedTable]:
         """Return channel and table that theta_e or theta_s is read from: itself, or the speed in its place."""
