@@ -1,10 +1,14 @@
 """Relation of motor and load position: ratio, skew, lost motion."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
+
+from jaxbl.quantity import Quantity
 
 from .least_squares import BlockRegression, fit_residual, fit_with_jackknife, mean_error, rms
 from .lost_motion import LostMotion, fit_lost_motion_by_direction, fit_lost_motion_by_load
@@ -65,21 +69,14 @@ class Gearing(LostMotion):
     def describe_lost_motion(self, unit: str) -> str:
         """Describe value, error and interval; for rad also in degrees."""
         low, high = self.lost_motion_interval
-        digits = _count_decimals(self.lost_motion_error)
-        size = f"{self.lost_motion:.{digits}f} ± {self.lost_motion_error:.{digits}f} {unit}"
-        value, error = np.degrees(self.lost_motion), np.degrees(self.lost_motion_error)
-        degrees = _count_decimals(error)
-        in_degrees = f"; {value:.{degrees}f} ± {error:.{degrees}f}°" if unit == "rad" else ""
-        return f"{size} (95 %: {low:.{digits}f} to {high:.{digits}f}{in_degrees})"
+        size, degrees = Quantity(self.lost_motion, self.lost_motion_error, unit=unit), ""
+        if unit == "rad":
+            degrees = f"; {Quantity(math.degrees(self.lost_motion), math.degrees(self.lost_motion_error))}°"
+        return f"{size} (95 %: {low:.5g} to {high:.5g}{degrees})"
 
     def exceeds_noise(self, noise: float) -> bool:
         """Return True if the lost motion exceeds its error and the noise (:func:`twist_noise`)."""
         return self.lost_motion > max(4.0 * self.lost_motion_error, noise)
-
-
-def _count_decimals(error: float) -> int:
-    """Return the number of decimals that shows two digits of an error."""
-    return int(np.clip(1 - np.floor(np.log10(error)), 0, 9)) if 0.0 < error < np.inf else 6
 
 
 def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math.inf) -> Gearing | None:
@@ -95,8 +92,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     which is infinite on a linear axis.
     """
     period, motor, load = grid.period, grid.values["theta_e"], grid.values["theta_s"]
-    part, usable = longest_segment(grid.segments), long_segments(grid.segments)
-    width = _velocity_bandwidth(load[part], period)
+    usable, width = long_segments(grid.segments), _velocity_bandwidth(grid, "theta_s")
     fit = _fit_with_skew(grid, width) if width and usable else None
     if fit is None:
         return None
@@ -104,8 +100,8 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     # the ratio is that of the whole motion, with the parts that repeat within it
     slopes, slope_errors = _fit_terms(target, rows[:, :4])
     residuals, slope = target - rows[:, :4] @ slopes, float(slopes[0])
-    spread = float(np.std(target))
-    residual = _rms(residuals) / spread if spread else np.inf
+    spread = float(np.std(target)) + 1e-300
+    residual = _rms(residuals) / spread
     # encoders are not late by many periods, and at a constant speed, to and fro, a delay looks like lost motion
     velocity, flank = rows[:, 1:3].T
     speed = _rms(velocity)
@@ -122,7 +118,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     motion = float(np.ptp(motor_there))
     is_wide = min(twist, least_twist) > WIDE_TWIST * motion
     # with stick and slip, or a coarse encoder, the load shows its direction no sooner than the motor
-    slow = min(width, _velocity_bandwidth(motor[part], period) or width)
+    slow = min(width, _velocity_bandwidth(grid, "theta_e") or width)
     lost_motion_fit = _fit_lost_motion(grid, aligned, 4.0 * slow, ratio, turn, is_wide=is_wide)
     if lost_motion_fit is None:
         # no flank is in contact for long: the rough regression has to do
@@ -134,7 +130,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     # with a gap as large as the motion a delay cannot be found
     has_skew = has_skew and not is_wide
     return Gearing(
-        **vars(replace(lost_motion_fit, twist_residual=lost_motion_fit.twist_residual / spread if spread else np.inf)),
+        **vars(replace(lost_motion_fit, twist_residual=lost_motion_fit.twist_residual / spread)),
         ratio=slope,
         ratio_error=float(np.hypot(slope_errors[0], slope * least_twist / motion if is_wide else 0.0)),
         skew=skew if has_skew else None,
@@ -156,25 +152,25 @@ def _fit_with_skew(grid: Grid, width: float) -> tuple[_MotorFit, float, bool] | 
     Returns:
         Its results, the skew, and True if there is one.
     """
-    skew, has_skew, fit = 0.0, True, None
+    skew, first, fit = 0.0, None, None
     # converges quadratically: five steps are ample
     for _ in range(5):
         fit = _regress_motor(grid, 4.0 * width, skew)
         if fit is None:
             return None
+        first = first or fit
         step = float(fit[2][1] / fit[2][0])
-        if not has_skew or abs(step) < 1e-3 * grid.period:
+        if abs(step) < 1e-3 * grid.period:
             break
         skew += step
         # a quarter of the fastest period: a load that moves on its own, no delay of an encoder
         if abs(skew) > 0.25 / width:
-            skew, has_skew = 0.0, False
+            return first, 0.0, False
     assert fit is not None
-    return fit, skew, has_skew
+    return fit, skew, True
 
 
-@dataclass(frozen=True)
-class Drift:
+class Drift(NamedTuple):
     """Growth of the skew of theta_s against theta_e over a log.
 
     Attributes:
@@ -198,7 +194,7 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
     The log is one that :func:`fit_gearing` can fit.
     """
     period = grid.period
-    width = _velocity_bandwidth(grid.values["theta_s"][longest_segment(grid.segments)], period)
+    width = _velocity_bandwidth(grid, "theta_s")
     constant = _regress_motor(grid, 4.0 * width, skew)
     if constant is None:
         return None
@@ -228,8 +224,9 @@ def fit_drift(grid: Grid, skew: float) -> Drift | None:
     return Drift(drift, abs(error), reach)
 
 
-def _velocity_bandwidth(positions: np.ndarray, period: float) -> float:
-    """Return the bandwidth of the velocity, Hz; for motion too slow for a spectrum, ten over its duration."""
+def _velocity_bandwidth(grid: Grid, channel: str) -> float:
+    """Return the bandwidth of a velocity, Hz; for motion too slow for a spectrum, ten over its duration."""
+    positions, period = grid.values[channel][longest_segment(grid.segments)], grid.period
     width = find_bandwidth(positions, period, differentiate=True)
     slow = 10.0 / (len(positions) * period)
     if width or len(positions) < MIN_SAMPLES:
@@ -286,21 +283,17 @@ def _fit_lost_motion(
     if best is None:
         return None if is_wide else fit_lost_motion_by_load(time, twist, position, velocity, turn)
     flank, is_clear = best
-    fit = fit_lost_motion_by_direction(twist, terms, flank, is_clear)
+    fit_by_direction = partial(fit_lost_motion_by_direction, twist, flank=flank, is_clear=is_clear)
+    fit = fit_by_direction(terms)
     if is_wide:
         # the wind-up of the shaft is part of this shift, and its share is unknown in so few cycles
-        constant_fit = fit_lost_motion_by_direction(twist, terms[:, :1], flank, is_clear)
+        constant_fit = fit_by_direction(terms[:, :1])
         return fit.enclose(constant_fit) if fit and constant_fit else fit
     if fit is None or fit.lost_motion_error > 0.25 * abs(fit.lost_motion):
         # at a constant speed, delays and wind-up look like lost motion: a delay is assumed to be at most a period
-        delay = ratio * period * _rms(velocity)
-        fit_without_velocity = fit_lost_motion_by_direction(
-            twist, np.delete(terms, 1, axis=1), flank, is_clear, other_error=delay
-        )
-        if fit_without_velocity is not None and (
-            fit is None or fit_without_velocity.lost_motion_error < 0.5 * fit.lost_motion_error
-        ):
-            fit = fit_without_velocity
+        other = fit_by_direction(np.delete(terms, 1, axis=1), other_error=ratio * period * _rms(velocity))
+        if other is not None and (fit is None or other.lost_motion_error < 0.5 * fit.lost_motion_error):
+            fit = other
     if fit is not None and fit.twist_residual < 0.25 * abs(fit.lost_motion):
         return fit
     # flanks by the direction of motion explain little: the load may change them
@@ -333,9 +326,9 @@ def find_flank(target: np.ndarray, terms: np.ndarray, flanks: Flanks) -> tuple[n
     return None if best is None else best[1:]
 
 
-def twist_noise(ratio: float, motor: ChannelStatistics, load: ChannelStatistics | None) -> float:
+def twist_noise(ratio: float, channels: Mapping[str, ChannelStatistics]) -> float:
     """Return the rms noise and resolution of both encoders together, or of one, at the motor, in their unit."""
-    encoders = [(1.0, motor)] if load is None else [(1.0, motor), (ratio, load)]
+    encoders = [(factor, channels[name]) for name, factor in (("theta_e", 1.0), ("theta_s", ratio)) if name in channels]
     sizes = [(factor * encoder.noise, factor * encoder.resolution / 12.0**0.5) for factor, encoder in encoders]
     return float(np.linalg.norm(sizes))
 

@@ -1,7 +1,7 @@
 """Inspect a measured log: judge which quantities it can identify, before anything is fitted to it."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +20,10 @@ from .signal_quality import low_pass, low_pass_motion
 from .table import POSITION_CHANNELS, LogTable
 
 _Answer = Literal["yes", "weak", "no"]
+_Judgement = tuple[_Answer, str]
+"""An answer and its reason, as in :class:`Identifiability`."""
+_Judgements = dict[str, _Judgement]
+"""Judgements by quantity."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +84,8 @@ class Inspection:
 
     @property
     def twist(self) -> np.ndarray | None:
-        """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None with one encoder."""
-        if self.gear_ratio is None or len(self.record.positions) < 2:
+        """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None without a ratio."""
+        if self.gear_ratio is None:
             return None
         twist = compute_twist(self.record, self.gear_ratio)
         return twist - np.median(twist)
@@ -95,7 +99,7 @@ class Inspection:
             "sample_period": record.sample_period,
             "start": record.start,
             "closed_loop": record.closed_loop,
-            "segments": [[float(record.time[s][0]), float(record.time[s][-1])] for s in record.segments],
+            "segments": [record.time[s][[0, -1]].tolist() for s in record.segments],
             "gear_ratio": self.gear_ratio,
             **asdict(statistics),
             "dynamics": None if statistics.dynamics is None else statistics.dynamics.to_dict(),
@@ -120,19 +124,18 @@ def inspect(
     """Read a measured log and judge what it can identify; arguments and errors are those of :func:`read_record`."""
     table = read_log_table(log)
     record = read_record(path, table, gear_ratio=gear_ratio, nominal=nominal)
-    has_both_sides, gearing = len(record.positions) == 2, record.statistics.gearing
+    gearing, element, ratio = record.statistics.gearing, None, None
+    if len(record.positions) == 2:
+        ratio = gear_ratio or (1.0 if table.kind == "element" else gearing and gearing.ratio)
     if table.kind == "element":
-        ratio = gear_ratio or 1.0 if has_both_sides else None
         element = fit_record_element(record, ratio)
-        reversals = 0 if element is None else element.reversals
-        return Inspection(record, table, ratio, reversals, tuple(_judge_element(element)), element)
-    ratio = gear_ratio if gearing is None or gear_ratio is not None else gearing.ratio
-    if not has_both_sides:
-        ratio = None
-    speed = compute_velocity(record)
-    reversals = _count_reversals(record, speed)
-    judgements = _judge_rigid_drive(record, speed) + _judge_transmission(record, speed, reversals, ratio)
-    return Inspection(record, table, ratio, reversals, tuple(judgements))
+        reversals, judgements = 0 if element is None else element.reversals, _judge_element(element)
+    else:
+        speed = compute_velocity(record)
+        reversals = _count_reversals(record, speed)
+        judgements = _judge_rigid_drive(record, speed) | _judge_transmission(record, reversals, ratio)
+    identifiability = tuple(Identifiability(quantity, *judgement) for quantity, judgement in judgements.items())
+    return Inspection(record, table, ratio, reversals, identifiability, element)
 
 
 def compute_twist(record: Record, gear_ratio: float | None) -> np.ndarray:
@@ -152,28 +155,25 @@ def fit_record_element(record: Record, gear_ratio: float | None) -> Element | No
 def make_rig_log(record: Record, gear_ratio: float | None) -> RigLog:
     """Return displacement and torque of an element; the noise is that of its readings with their resolution."""
     assert record.torque is not None
-    statistics = record.statistics.channels
-    noise = twist_noise(gear_ratio or 1.0, statistics["theta_e"], statistics.get("theta_s"))
-    displacement = compute_twist(record, gear_ratio)
-    return RigLog(displacement, record.torque, record.segments, record.sample_period, noise)
+    noise = twist_noise(gear_ratio or 1.0, record.statistics.channels)
+    return RigLog(compute_twist(record, gear_ratio), record.torque, record.segments, record.sample_period, noise)
 
 
 _ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap", "slip": "slip"} | SIZE_NAMES
 """Quantity of an element -> name of its number."""
 
 
-def _judge_element(element: Element | None) -> list[Identifiability]:
+def _judge_element(element: Element | None) -> _Judgements:
     if element is None:
         reason = "the displacement never turns back, or hardly moves: load it to and fro, through the gap"
-        return _judge_alike(_ELEMENT_NUMBERS, "no", reason)
-    judgements = []
+        return dict.fromkeys(_ELEMENT_NUMBERS, ("no", reason))
+    reason = "does not predict the torque better on parts of the log that are left out"
+    judgements: _Judgements = dict.fromkeys(_ELEMENT_NUMBERS, ("no", reason))
     for quantity, key in _ELEMENT_NUMBERS.items():
-        answer: _Answer = "no"
-        reason = "does not predict the torque better on parts of the log that are left out"
         if (number := element.numbers.get(key)) is not None:
             low, high = number.ends()
-            answer, reason = "weak" if key in element.open else "yes", f"{key} = {number}, 95 %: {low:.4g} to {high:.4g}"
-        judgements.append(Identifiability(quantity, answer, reason))
+            answer = "weak" if key in element.open else "yes"
+            judgements[quantity] = answer, f"{key} = {number}, 95 %: {low:.4g} to {high:.4g}"
     return judgements
 
 
@@ -184,10 +184,19 @@ def main_side(record: Record) -> str:
 
 def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Differentiate the low-passed position of a side, by default the main one; rad/s (m/s), shape (samples,)."""
-    side = side or main_side(record)
-    cutoff = 4.0 * record.statistics.channels[POSITION_CHANNELS[side]].bandwidth or math.inf
+    return _compute_motion(record, side or main_side(record))[1]
+
+
+def _compute_motion(record: Record, side: str) -> np.ndarray:
+    """Return the low-passed position of a side, its velocity and acceleration, shape (3, samples)."""
+    cutoff = _choose_cutoff(record, POSITION_CHANNELS[side])
     places = [record.positions[side][segment] for segment in record.segments]
-    return np.concatenate([low_pass_motion(place, cutoff, record.sample_period)[1] for place in places])
+    return np.concatenate([low_pass_motion(place, cutoff, record.sample_period) for place in places], axis=1)
+
+
+def _choose_cutoff(record: Record, channel: str) -> float:
+    """Choose the cutoff of a low-pass, Hz, that keeps the motion of an encoder; infinite if that is hidden by noise."""
+    return 4.0 * record.statistics.channels[channel].bandwidth or math.inf
 
 
 def _is_moving(speed: np.ndarray) -> np.ndarray:
@@ -199,36 +208,35 @@ def _count_reversals(record: Record, speed: np.ndarray) -> int:
     return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
 
 
-def _judge_alike(quantities: Iterable[str], answer: _Answer, reason: str) -> list[Identifiability]:
-    return [Identifiability(quantity, answer, reason) for quantity in quantities]
-
-
-_FRICTIONS = "viscous friction", "Coulomb friction"
 _INSEPARABLE = 10.0
 """Variance inflation factor from which on a term is hardly told from others: nine tenths of it are in them."""
 
 
-def _judge_rigid_drive(record: Record, speed: np.ndarray) -> list[Identifiability]:
-    names = ("inertia", *_FRICTIONS, "constant torque")
+def _judge_rigid_drive(record: Record, speed: np.ndarray) -> _Judgements:
+    names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
     torque, gearing = record.torque, record.statistics.gearing
     if torque is None:
-        return _judge_alike(names, "no", "no torque was recorded: the log shows kinematics only")
+        return dict.fromkeys(names, ("no", "no torque was recorded: the log shows kinematics only"))
     if np.ptp(torque) == 0.0:
         reason = "the input is constant: free motion gives only ratios to the inertia (or to a known gravity torque)"
-        return _judge_alike(names, "weak", reason)
+        return dict.fromkeys(names, ("weak", reason))
     if record.statistics.dynamics is None:
-        return _judge_alike(names, "no", "the motion does not exceed the noise")
-    share = _minor_share(speed)
-    constant = Identifiability(names[3], "yes", f"motion in both directions ({100 * share:.0f} % in the less frequent one)")
-    if share < _ONE_WAY:
-        constant = Identifiability(names[3], "weak", f"{_ONE_DIRECTION} {names[2]}")
+        return dict.fromkeys(names, _HIDDEN)
+    share, judgements = _minor_share(speed), _Judgements()
     if gearing is None or not gearing.is_loose:
-        return [*_judge_motion(record, record.statistics.dynamics, main_side(record)), constant]
-    # the torque moves both sides, whatever lies between them
-    fits = {side: _fit_side(record, side) for side in POSITION_CHANNELS}
-    return [judgement for side, fit in fits.items() for judgement in _judge_motion(record, fit, side, f"{side} ")] + [
-        constant
-    ]
+        judgements |= _judge_motion(record, record.statistics.dynamics, main_side(record))
+    else:
+        # the torque moves both sides, whatever lies between them
+        for side in POSITION_CHANNELS:
+            motion = _judge_motion(record, _fit_side(record, side), side)
+            judgements |= {f"{side} {name}": judgement for name, judgement in motion.items()}
+    judgements["constant torque"] = "yes", f"motion in both directions ({100 * share:.0f} % in the less frequent one)"
+    if share < _ONE_WAY:
+        judgements["constant torque"] = "weak", f"{_ONE_DIRECTION} Coulomb friction"
+    return judgements
+
+
+_HIDDEN: _Judgement = "no", "the motion does not exceed the noise"
 
 
 def _fit_side(record: Record, side: str) -> RigidFit | None:
@@ -249,19 +257,23 @@ def _minor_share(speed: np.ndarray) -> float:
     return float(min((moving > 0).mean(), (moving < 0).mean()))
 
 
-def _judge_motion(record: Record, rigid_fit: RigidFit | None, side: str, lead: str = "") -> list[Identifiability]:
-    """Judge inertia and frictions by a fit of the torque to the motion of a side; `lead` begins their names."""
-    inertia, viscous, coulomb = names = [f"{lead}{name}" for name in ("inertia", *_FRICTIONS)]
+def _judge_motion(record: Record, rigid_fit: RigidFit | None, side: str) -> _Judgements:
+    """Judge inertia and frictions by a fit of the torque to the motion of a side."""
     if rigid_fit is None:
-        return _judge_alike(names, "no", "the motion does not exceed the noise")
+        return dict.fromkeys(("inertia", "viscous friction", "Coulomb friction"), _HIDDEN)
     speed = compute_velocity(record, side)
     slow, fast = np.quantile(np.abs(speed[_is_moving(speed)]), [0.05, 0.95])
     width = record.statistics.channels[POSITION_CHANNELS[side]].bandwidth
-
-    def judge(name: str, i: int, evidence: str, similar_term: str) -> Identifiability:
-        value, error, inflation, share = (
-            float(x[i]) for x in (rigid_fit.values, rigid_fit.errors, rigid_fit.inflation, rigid_fit.shares)
-        )
+    speeds = f"speeds of {slow:.3g} to {fast:.3g}"
+    evidence_and_similar_term = {
+        "inertia": (f"motion up to {width:.3g} Hz", "a spring or gravity"),
+        "viscous friction": (speeds, "Coulomb friction"),
+        "Coulomb friction": (f"{_count_reversals(record, speed)} reversals", "viscous friction"),
+    }
+    judgements = _Judgements()
+    terms = zip(rigid_fit.values, rigid_fit.errors, rigid_fit.inflation, rigid_fit.shares, strict=True)
+    for (name, (evidence, similar_term)), term in zip(evidence_and_similar_term.items(), terms, strict=False):
+        value, error, inflation, share = term
         percent, weakness = f"{100 * share:.0f} % of the torque", ""
         if inflation > _INSEPARABLE:
             weakness = f"hard to separate from {similar_term} here (variance × {inflation:.0f})"
@@ -271,61 +283,55 @@ def _judge_motion(record: Record, rigid_fit: RigidFit | None, side: str, lead: s
             weakness = f"a rough fit finds no positive value ({percent}): other effects hide it"
         elif error > 0.2 * abs(value):
             weakness = f"a rough fit finds it only to ± {100 * error / value:.0f} % ({percent})"
-        return Identifiability(name, "weak" if weakness else "yes", weakness or f"{evidence}: {percent}")
-
-    speeds = f"speeds of {slow:.3g} to {fast:.3g}"
-    judgements = [
-        judge(inertia, 0, f"motion up to {width:.3g} Hz", "a spring or gravity"),
-        judge(viscous, 1, speeds, _FRICTIONS[1]),
-        judge(coulomb, 2, f"{_count_reversals(record, speed)} reversals", _FRICTIONS[0]),
-    ]
+        judgements[name] = ("weak" if weakness else "yes"), weakness or f"{evidence}: {percent}"
     if _minor_share(speed) < _ONE_WAY:
-        judgements[2] = Identifiability(coulomb, "weak", f"{_ONE_DIRECTION} a constant torque")
+        judgements["Coulomb friction"] = "weak", f"{_ONE_DIRECTION} a constant torque"
     if fast < 1.5 * slow:
-        judgements[1:] = _judge_alike(names[1:], "weak", f"{speeds} are too close to separate viscous from Coulomb friction")
+        reason = f"{speeds} are too close to separate viscous from Coulomb friction"
+        judgements |= dict.fromkeys(("viscous friction", "Coulomb friction"), ("weak", reason))
     return judgements
 
 
-def _judge_transmission(record: Record, speed: np.ndarray, reversals: int, ratio: float | None) -> list[Identifiability]:
+def _judge_transmission(record: Record, reversals: int, ratio: float | None) -> _Judgements:
     names = ("gear ratio", "lost motion", "stiffness")
-    gearing, channels = record.statistics.gearing, record.statistics.channels
+    gearing = record.statistics.gearing
     if len(record.positions) < 2:
         missing_side = "load" if "motor" in record.positions else "motor"
         reason = f"there is no {missing_side} encoder: the transmission in between is not observed"
+        judgements: _Judgements = dict.fromkeys(names, ("no", reason))
         if missing_side == "load" and record.torque is not None and reversals >= 2:
             advice = "jaxbl identify with a model of two inertias tries to find it from the motor's encoder alone"
-            return [Identifiability(names[0], "no", reason), *_judge_alike(names[1:], "weak", advice)]
-        return _judge_alike(names, "no", reason)
+            judgements |= dict.fromkeys(names[1:], ("weak", advice))
+        return judgements
     if gearing is None or ratio is None:
-        return _judge_alike(names, "no", "the motion does not exceed the noise")
-    share = min(gearing.twist, gearing.least_twist) / gearing.motion
+        return dict.fromkeys(names, _HIDDEN)
     remark = f"{percent(gearing.residual)} of theta_e is not explained"
     if gearing.is_loose:
+        share = min(gearing.twist, gearing.least_twist) / gearing.motion
         remark = f"gap and wind-up take {100 * share:.0f} % of the range of theta_e"
-    noise = twist_noise(ratio, channels["theta_e"], channels["theta_s"])
+    noise = twist_noise(ratio, record.statistics.channels)
     answer = "yes" if gearing.residual < 0.05 and not gearing.is_loose else "weak"
-    return [
-        Identifiability("gear ratio", answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {remark}"),
-        _judge_lost_motion(record, gearing, reversals, ratio, noise),
-        Identifiability("stiffness", *_judge_stiffness(record, speed, ratio, noise)),
-    ]
+    return {
+        "gear ratio": (answer, f"{gearing.ratio:.5g} ± {gearing.ratio_error:.1g}; {remark}"),
+        "lost motion": _judge_lost_motion(record, gearing, reversals, ratio, noise),
+        "stiffness": _judge_stiffness(record, ratio, noise),
+    }
 
 
-def _judge_lost_motion(record: Record, gearing: Gearing, reversals: int, ratio: float, noise: float) -> Identifiability:
+def _judge_lost_motion(record: Record, gearing: Gearing, reversals: int, ratio: float, noise: float) -> _Judgement:
     unit = record.statistics.channels["theta_e"].unit
     size = gearing.describe_lost_motion(unit)
-    answer, reason = "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
     if gearing.flank == "load":
-        answer, reason = "yes", f"theta_e shifts by {size} as the load torque changes its sign"
-    elif reversals < 2:
-        answer, reason = "no", f"{reversals} reversals: both flanks of the gap must come into contact"
-    elif gearing.is_loose and (half := _find_loose_gap(record, ratio)) > max(noise, _BLURRED * gearing.twist):
-        answer, reason = "yes", f"the torque in the gear over the twist shows a half gap of about {half:.2g} {unit}"
-    elif gearing.is_loose:
-        reason = f"shift of {size} includes the wind-up, which this motion does not separate"
-    elif gearing.exceeds_noise(noise):
-        answer, reason = "yes", f"theta_e shifts by {size} from flank to flank"
-    return Identifiability("lost motion", answer, reason)
+        return "yes", f"theta_e shifts by {size} as the load torque changes its sign"
+    if reversals < 2:
+        return "no", f"{reversals} reversals: both flanks of the gap must come into contact"
+    if gearing.is_loose:
+        if (half := _find_loose_gap(record, ratio)) > max(noise, _BLURRED * gearing.twist):
+            return "yes", f"the torque in the gear over the twist shows a half gap of about {half:.2g} {unit}"
+        return "weak", f"shift of {size} includes the wind-up, which this motion does not separate"
+    if gearing.exceeds_noise(noise):
+        return "yes", f"theta_e shifts by {size} from flank to flank"
+    return "weak", f"shift of theta_e from flank to flank is {size}, noise {noise:.2g} {unit}"
 
 
 _BLURRED = 0.01
@@ -335,13 +341,11 @@ _BLURRED = 0.01
 def _find_loose_gap(record: Record, ratio: float) -> float:
     """Roughly find the half gap, rad (m), from the twist and what the motor's own inertia and friction leave of the torque;
     0 where these show none."""
-    torque, period = record.torque, record.sample_period
+    torque = record.torque
     fit = None if torque is None else _fit_side(record, "motor")
     if torque is None or fit is None or fit.inflation[0] > _INSEPARABLE:
         return 0.0
-    cutoff = 4.0 * record.statistics.channels["theta_e"].bandwidth
-    motion = [low_pass_motion(record.positions["motor"][segment], cutoff, period)[1:] for segment in record.segments]
-    velocity, acceleration = np.concatenate(motion, axis=1)
+    _, velocity, acceleration = _compute_motion(record, "motor")
     through = torque - fit.values[:3] @ np.stack([acceleration, velocity, smooth_sign(velocity)])
     gear = fit_element(make_rig_log(record, ratio)._replace(torque=through), linear=False)
     return (
@@ -349,13 +353,13 @@ def _find_loose_gap(record: Record, ratio: float) -> float:
     )
 
 
-def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: float) -> tuple[_Answer, str]:
+def _judge_stiffness(record: Record, ratio: float, noise: float) -> _Judgement:
     """Judge the stiffness by twist over torque within one direction of motion; `noise` is that of the twist, rms."""
     if record.transmitted is None and (record.torque is None or np.ptp(record.torque) == 0.0):
         return "no", "no varying torque was recorded"
     if record.statistics.channels["theta_e"].bandwidth == 0.0:
         return "no", "the motion does not exceed the noise"
-    slope, error, spread = fit_twist(record, speed, ratio)
+    slope, error, spread = fit_twist(record, ratio)
     if not np.isfinite(slope):
         return "weak", "the log is too short to see how the twist follows the torque"
     windup = abs(slope) * spread
@@ -365,7 +369,7 @@ def _judge_stiffness(record: Record, speed: np.ndarray, ratio: float, noise: flo
     return "yes", f"the twist follows the torque: {windup:.2g} {unit} rms against a noise of {noise:.2g}"
 
 
-def fit_twist(record: Record, speed: np.ndarray, ratio: float) -> tuple[float, float, float]:
+def fit_twist(record: Record, ratio: float) -> tuple[float, float, float]:
     """Fit the twist at the motor to the measured torque, direction and speed.
 
     Returns:
@@ -373,8 +377,8 @@ def fit_twist(record: Record, speed: np.ndarray, ratio: float) -> tuple[float, f
     """
     torque = record.torque if record.transmitted is None else record.transmitted
     assert torque is not None
-    twist = compute_twist(record, ratio)
-    cutoff = 4.0 * record.statistics.channels["theta_e"].bandwidth or math.inf
+    twist, speed = compute_twist(record, ratio), compute_velocity(record)
+    cutoff = _choose_cutoff(record, "theta_e")
     signals = np.stack([twist, torque, np.sign(speed), speed, np.ones(len(twist))], axis=1)
     smooth = np.concatenate([low_pass(signals[segment], cutoff, record.sample_period) for segment in record.segments])
     slopes, errors = fit_with_jackknife(smooth[:, 0], smooth[:, 1:])

@@ -369,8 +369,5 @@ def note_gearing(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelS
             f"{times} s; {low:.2g} to {high:.2g} {unit} by position."
             + (single_change if len(gearing.flank_times) == 1 else "")
         )
-    elif (
-        gearing.exceeds_noise(twist_noise(gearing.ratio, statistics["theta_e"], statistics["theta_s"]))
-        and not gearing.is_loose
-    ):
+    elif gearing.exceeds_noise(twist_noise(gearing.ratio, statistics)) and not gearing.is_loose:
         file.notes.append(f"{text}, from {gearing.flank_changes} changes of the flank by the direction of motion.")

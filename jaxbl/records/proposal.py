@@ -14,7 +14,7 @@ from jaxbl.errors import InputError
 from .alignment import NominalDrive
 from .channels import POSITION_FACTORS, SPEED_FACTORS
 from .files import LogFile, read_log_file
-from .inspection import Inspection, compute_twist, compute_velocity, fit_twist, inspect
+from .inspection import Inspection, compute_twist, fit_twist, inspect
 from .libraries import ColumnName
 from .table import POSITION_CHANNELS
 from .time_stamps import SECONDS_PER_UNIT
@@ -343,7 +343,7 @@ def _fit_nominal_drive(inspection: Inspection, guesses: list[str], known_ratio: 
     drive = NominalDrive(half_inertia, 0.5 * viscous, half_inertia * ratio**2, 0.5 * viscous * ratio**2, ratio)
     guesses.append("Inertia and friction are divided evenly between the sides, and the stiffness is a rough guess.")
     # half of the torque winds the shaft up
-    slope, slope_error, _ = fit_twist(record, compute_velocity(record), ratio)
+    slope, slope_error, _ = fit_twist(record, ratio)
     twist = np.std(compute_twist(record, ratio)) - 0.5 * gearing.lost_motion
     least = 0.5 * np.std(record.torque) / max(twist, 0.1 * gearing.lost_motion, 1e-300)
     # False for nan, too
