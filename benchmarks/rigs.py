@@ -78,7 +78,7 @@ def main() -> None:
     for i in range(asked.count):
         truth, x, u, noise = simulate(np.random.default_rng([asked.seed, i]))
         start = time.perf_counter()
-        fit = fit_element(RigLog(x, u, [slice(0, len(x))], PERIOD, noise), linear=False)
+        fit = fit_element(RigLog(x, u, [slice(0, len(x))], PERIOD, noise))
         seconds.append(time.perf_counter() - start)
         assert fit is not None
         missed += [f"{i} {name}" for name in truth if name not in fit.numbers]

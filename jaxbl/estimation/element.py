@@ -14,8 +14,8 @@ from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
-from jaxbl.records.element import Element, element_error
-from jaxbl.records.inspection import compute_twist, fit_record_element, make_rig_log
+from jaxbl.records.element import Element, element_error, fit_element
+from jaxbl.records.inspection import make_rig_log
 
 from .logs import SealedRecord, hash_task
 
@@ -118,7 +118,8 @@ def run_element(task: ElementTask) -> ElementIdentification:
         InputError: a log that shows no stiffness.
     """
     record = task.record
-    element = fit_record_element(record, task.gear_ratio)
+    log = make_rig_log(record, task.gear_ratio)
+    element = fit_element(log)
     if element is None:
         raise InputError(
             f"{record.path}: the displacement never turns back, or hardly moves; a log of a transmission should load it to "
@@ -132,8 +133,7 @@ def run_element(task: ElementTask) -> ElementIdentification:
             f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){remark}; "
             "see columns and signs in [log]"
         )
-    moved = compute_twist(record, task.gear_ratio)
-    trace = pd.DataFrame({"t": record.time, "u": record.torque, "displacement": moved, "torque": element.torque})
+    trace = pd.DataFrame({"t": record.time, "u": log.torque, "displacement": log.position, "torque": element.torque})
     return ElementIdentification(task, element, to_jsonable(_summary(task, element)), trace, _tables(element))
 
 

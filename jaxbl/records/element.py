@@ -14,7 +14,7 @@ blocks of the log to which its size was not fitted.
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -118,6 +118,7 @@ class RigLog(NamedTuple):
         segments: contiguous parts.
         period: of sampling, s.
         noise: of the displacement, rad (m) rms.
+        unit: of the displacement, rad or m.
     """
 
     position: np.ndarray
@@ -125,6 +126,7 @@ class RigLog(NamedTuple):
     segments: Sequence[slice]
     period: float
     noise: float
+    unit: str = "rad"
 
 
 @dataclass(frozen=True)
@@ -166,13 +168,12 @@ class _Rig:
         error = rms(self.fitted_torque - self.compute_torque(model))
         return error, error / float(np.std(self.fitted_torque))
 
-    def compute_columns(self, terms: Sequence[str], shapes: np.ndarray) -> np.ndarray:
+    def compute_columns(self, terms: Sequence[str], shapes: Mapping[str, float]) -> np.ndarray:
         """Return the torque per unit of stiffness, offset, and sizes of terms in order; shape (rows, linear numbers)."""
-        shapes_by_name = dict(zip(_shape_names(terms), shapes, strict=True))
-        x = self.position - shapes_by_name.get("centre", 0.0)
-        b = shapes_by_name.get("half_gap", 0.0)
+        x = self.position - shapes.get("centre", 0.0)
+        b = shapes.get("half_gap", 0.0)
         if "slip" in terms:
-            x = x - self._drag(b + shapes_by_name["windup"])
+            x = x - self._drag(b + shapes["windup"])
         deflection = x - np.clip(x, -b, b)
         # no damping inside the gap; a part of it in a sample that crosses an end of the gap
         contact = np.clip((np.abs(x) - b) / self.blur + 0.5, 0.0, 1.0) if "gap" in terms else 1.0
@@ -182,7 +183,7 @@ class _Rig:
             "friction under load": np.abs(deflection) * self.direction,
         }
         if "hysteresis" in terms:
-            signals["hysteresis"] = self._compute_hysteresis(deflection, shapes_by_name["length"])
+            signals["hysteresis"] = self._compute_hysteresis(deflection, shapes["length"])
         columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
         return np.stack([column[self.rows] for column in columns], axis=1)
 
@@ -213,30 +214,29 @@ class _Rig:
         return h
 
 
-def fit_element(log: RigLog, *, linear: bool) -> Element | None:
-    """Fit a transmission to its displacement (`linear`: in m) and torque; None if it never turns back, or hardly moves."""
+def fit_element(log: RigLog) -> Element | None:
+    """Fit a transmission to its displacement and torque; None if it never turns back, or hardly moves."""
     rig = _prepare_rig(_average_samples(log))
     if rig is None:
         return None
     # either way may end at a model that no single step improves
     models = [
         _add_terms(rig, _fit_model(rig, ())),
-        _add_terms(rig, _drop_terms(rig, _drop_negative_terms(rig, _fit_model(rig, TERMS)))),
+        _add_terms(rig, _drop_terms(rig, _fit_model(rig, TERMS))),
     ]
     models.sort(key=lambda model: len(model.sizes) + len(model.shapes))
     best = models[1] if _compute_gain(rig, *models) is not None else models[0]
     best = _drop_terms(rig, best)
     series = _drop_terms(rig, _fit_model(rig, _SERIES))
-    if "slip" in series.terms and series.is_possible and _compute_gain(rig, best, series) is not None:
+    if "slip" in series.terms and series.sizes[0] > 0.0 and _compute_gain(rig, best, series) is not None:
         best = series
     gains = {term: _compute_gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
-    full_rig = _prepare_rig(log)
-    return _make_element(rig, full_rig or rig, best, gains, linear)
+    return _make_element(log, rig, best, gains)
 
 
 def _average_samples(log: RigLog) -> RigLog:
     """Average neighbouring samples of a long log."""
-    position, torque, segments, period, noise = log
+    position, torque, segments, period, noise, unit = log
     width = find_motion_bandwidth(position, segments, period) or 1.0 / (len(position) * period)
     count = min(math.ceil(len(position) / _MAX_SAMPLES), int(1.0 / (_SAMPLES_PER_PERIOD * width * period)))
     if count < 2:
@@ -249,11 +249,11 @@ def _average_samples(log: RigLog) -> RigLog:
             parts.append(samples.reshape(2, mean_count, count).mean(axis=2))
     ends = itertools.accumulate((part.shape[1] for part in parts), initial=0)
     position, torque = np.concatenate(parts, axis=1)
-    return RigLog(position, torque, slices_between(ends), count * period, noise / math.sqrt(count))
+    return RigLog(position, torque, slices_between(ends), count * period, noise / math.sqrt(count), unit)
 
 
 def _prepare_rig(log: RigLog) -> _Rig | None:
-    position, torque, segments, period, noise = log
+    position, torque, segments, period, noise, _ = log
     width = find_motion_bandwidth(position, segments, period)
     cutoff = _CUTOFF_RATIO * width or math.inf
     smooth, rate, direction = np.zeros((3, len(position)))
@@ -301,30 +301,21 @@ def _find_reversals(values: np.ndarray, least: float) -> list[int]:
 
 
 class Model(NamedTuple):
-    """A model on a log: its terms, shapes, and linear numbers."""
+    """A model on a log: its terms, shapes, and linear numbers, which are positive but for stiffness and offset."""
 
     terms: tuple[str, ...]
-    shapes: np.ndarray
+    shapes: dict[str, float]
     sizes: np.ndarray
-
-    @property
-    def is_possible(self) -> bool:
-        """True if stiffness and all sizes but the offset are positive."""
-        return bool((np.delete(self.sizes, 1) > 0.0).all())
 
 
 def _add_terms(rig: _Rig, best: Model) -> Model:
     """Add terms, as long as one of them lowers the error clearly."""
     while True:
-        models = [
-            _drop_negative_terms(rig, _fit_model(rig, (*best.terms, term), best), term)
-            for term in TERMS
-            if term not in best.terms
-        ]
+        models = {term: _fit_model(rig, (*best.terms, term), best) for term in TERMS if term not in best.terms}
         candidates = [
             (len(model.shapes), -gain, model)
-            for model in models
-            if model.is_possible and (gain := _compute_gain(rig, best, model)) is not None
+            for term, model in models.items()
+            if term in model.terms and model.sizes[0] > 0.0 and (gain := _compute_gain(rig, best, model)) is not None
         ]
         if not candidates:
             return best
@@ -349,53 +340,46 @@ def _drop_terms(rig: _Rig, model: Model) -> Model:
 
 
 def _fit_without(rig: _Rig, model: Model, term: str) -> Model:
-    return _drop_negative_terms(rig, _fit_model(rig, tuple(name for name in model.terms if name != term), model))
-
-
-def _drop_negative_terms(rig: _Rig, model: Model, new_term: str = "") -> Model:
-    """Drop terms with a negative size; if `new_term` is among them, return the model unchanged."""
-    while True:
-        sizes = dict(zip((term for term in model.terms if term in SIZE_NAMES), model.sizes[2:], strict=True))
-        terms = tuple(term for term in model.terms if sizes.get(term, 1.0) > 0.0)
-        if terms == model.terms or not sizes.get(new_term, 1.0) > 0.0:
-            return model
-        model = _fit_model(rig, terms, model)
-
-
-def _shape_names(terms: Sequence[str]) -> list[str]:
-    names = dict.fromkeys(name for term in terms for name in _SHAPES_BY_TERM.get(term, ()))
-    # a transmission that slips has no centre
-    return [name for name in names if name != "centre" or "slip" not in terms]
+    return _fit_model(rig, tuple(name for name in model.terms if name != term), model)
 
 
 def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> Model:
-    """Fit a model by least squares. The search starts at the shapes of `near`; other shapes start at the best of a grid."""
+    """Fit a model by least squares, without terms that then have a negative size.
+
+    The search starts at the shapes of `near`; other shapes start at the best of a grid.
+    """
     from scipy.optimize import least_squares
 
-    names = _shape_names(terms)
+    names = dict.fromkeys(name for term in terms for name in _SHAPES_BY_TERM.get(term, ()))
+    if "slip" in terms:
+        # a transmission that slips has no centre
+        names.pop("centre", None)
     half, middle = rig.half_range, 0.5 * (rig.position.min() + rig.position.max())
-    near_shapes = dict(zip(_shape_names(near.terms), near.shapes, strict=True)) if near is not None else {}
 
     def scale_shapes(name: str, shares: tuple[float, ...]) -> list[float]:
         return [half * share + (middle if name == "centre" else 0.0) for share in shares]
 
     def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
-        return fit_residual(rig.fitted_torque, rig.compute_columns(terms, shapes))
+        return fit_residual(rig.fitted_torque, rig.compute_columns(terms, dict(zip(names, shapes, strict=True))))
 
-    shapes = np.empty(0)
+    shapes: dict[str, float] = {}
     if names:
         low, high = np.array([scale_shapes(name, _SHAPE_BOUNDS[name]) for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
-        choices = ([near_shapes[name]] if name in near_shapes else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
+        known = {} if near is None else near.shapes
+        choices = ([known[name]] if name in known else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
         starts = sorted(map(np.array, itertools.product(*choices)), key=lambda start: rms(compute_residual(start, few)))
-        inside = low + 1e-9 * half, high - 1e-9 * half
-        solutions = [search(np.clip(start, *inside), args=(few,)) for start in starts[:3]]
+        solutions = [search(start, args=(few,)) for start in starts[:3]]
         best = min(solutions, key=lambda solution: solution.cost)
-        shapes = search(best.x, args=(rig,)).x
+        shapes = dict(zip(names, search(best.x, args=(rig,)).x.tolist(), strict=True))
     columns = rig.compute_columns(terms, shapes)
     scale = column_rms(columns) + 1e-300
-    return Model(terms, shapes, np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale)
+    sizes = np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale
+    size_by_term = dict(zip((term for term in terms if term in SIZE_NAMES), sizes[2:], strict=True))
+    positive = tuple(term for term in terms if size_by_term.get(term, 1.0) > 0.0)
+    model = Model(terms, shapes, sizes)
+    return model if positive == terms else _fit_model(rig, positive, model)
 
 
 def _held_out_errors(rig: _Rig, model: Model) -> np.ndarray:
@@ -415,19 +399,14 @@ def _compute_gain(rig: _Rig, without: Model, model: Model) -> float | None:
     return math.expm1(mean) if mean > _SURE_ERRORS * mean_error(gains) else None
 
 
-def _make_element(rig: _Rig, full_rig: _Rig, model: Model, gains: dict[str, float], linear: bool) -> Element:
+def _make_element(log: RigLog, rig: _Rig, model: Model, gains: dict[str, float]) -> Element:
     """Compute the numbers, with errors by a jackknife over blocks: these hold for errors of any correlation in time."""
-    names = [
-        "stiffness",
-        "offset",
-        *(SIZE_NAMES[term] for term in model.terms if term in SIZE_NAMES),
-        *_shape_names(model.terms),
-    ]
-    values = np.concatenate([model.sizes, model.shapes])
+    names = ["stiffness", "offset", *(SIZE_NAMES[term] for term in model.terms if term in SIZE_NAMES), *model.shapes]
+    values = np.array([*model.sizes, *model.shapes.values()])
     slopes, step = [], 1e-4 * rig.half_range
-    for offset in step * np.eye(len(model.shapes)):
-        ends = model.shapes - offset, model.shapes + offset
-        low, high = (rig.compute_torque(model._replace(shapes=shapes)) for shapes in ends)
+    for name, value in model.shapes.items():
+        ends = ({name: value - step}, {name: value + step})
+        low, high = (rig.compute_torque(model._replace(shapes=model.shapes | end)) for end in ends)
         slopes.append((high - low) / (2.0 * step))
     jacobian = np.column_stack([rig.compute_columns(model.terms, model.shapes), *slopes])
     residual = rig.fitted_torque - rig.compute_torque(model)
@@ -450,8 +429,9 @@ def _make_element(rig: _Rig, full_rig: _Rig, model: Model, gains: dict[str, floa
             low = max(low, 0.0)
             if not error < _MAX_RELATIVE_ERROR * abs(value):
                 open_.append(name)
-        unit = on_a_line(_UNITS[name]) if linear else _UNITS[name]
+        unit = on_a_line(_UNITS[name]) if log.unit == "m" else _UNITS[name]
         numbers[name] = Quantity(value, error, (low, high), unit)
+    full_rig = _prepare_rig(log) or rig
     torque = np.full(len(full_rig.position), np.nan)
     torque[full_rig.rows] = full_rig.compute_torque(model)
     reversals = sum(not begins for _, begins in rig.stretches)

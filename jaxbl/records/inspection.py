@@ -128,7 +128,7 @@ def inspect(
     if len(record.positions) == 2:
         ratio = gear_ratio or (1.0 if table.kind == "element" else gearing and gearing.ratio)
     if table.kind == "element":
-        element = fit_record_element(record, ratio)
+        element = fit_element(make_rig_log(record, ratio))
         reversals, judgements = 0 if element is None else element.reversals, _judge_element(element)
     else:
         speed = compute_velocity(record)
@@ -147,16 +147,12 @@ def compute_twist(record: Record, gear_ratio: float | None) -> np.ndarray:
     return motor if load is None else motor - (gear_ratio or 1.0) * load
 
 
-def fit_record_element(record: Record, gear_ratio: float | None) -> Element | None:
-    """Fit a transmission on a test rig to its log; None if the log does not show one."""
-    return fit_element(make_rig_log(record, gear_ratio), linear=record.statistics.channels["theta_e"].unit == "m")
-
-
 def make_rig_log(record: Record, gear_ratio: float | None) -> RigLog:
     """Return displacement and torque of an element; the noise is that of its readings with their resolution."""
     assert record.torque is not None
-    noise = twist_noise(gear_ratio or 1.0, record.statistics.channels)
-    return RigLog(compute_twist(record, gear_ratio), record.torque, record.segments, record.sample_period, noise)
+    channels, displacement = record.statistics.channels, compute_twist(record, gear_ratio)
+    noise, unit = twist_noise(gear_ratio or 1.0, channels), channels["theta_e"].unit
+    return RigLog(displacement, record.torque, record.segments, record.sample_period, noise, unit)
 
 
 _ELEMENT_NUMBERS = {"stiffness": "stiffness", "gap": "half_gap", "slip": "slip"} | SIZE_NAMES
@@ -347,7 +343,7 @@ def _find_loose_gap(record: Record, ratio: float) -> float:
         return 0.0
     _, velocity, acceleration = _compute_motion(record, "motor")
     through = torque - fit.values[:3] @ np.stack([acceleration, velocity, smooth_sign(velocity)])
-    gear = fit_element(make_rig_log(record, ratio)._replace(torque=through), linear=False)
+    gear = fit_element(make_rig_log(record, ratio)._replace(torque=through))
     return (
         0.0 if gear is None or "half_gap" in gear.open or "gap" not in gear.model.terms else gear.numbers["half_gap"].value
     )

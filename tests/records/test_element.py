@@ -27,7 +27,7 @@ def simulate_rig(count=2400, seed=1, gap=GAP):
 
 def test_a_gap_hysteresis_and_friction_are_told_apart():
     x, u = simulate_rig()
-    fit = fit_element(RigLog(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, 1e-5), linear=False)
+    fit = fit_element(RigLog(x, u, [slice(0, 1300), slice(1300, 2400)], PERIOD, 1e-5))
     assert set(fit.model.terms) == {"gap", "dry friction", "hysteresis"}
     truth = {
         "stiffness": STIFFNESS, "half_gap": GAP, "centre": CENTRE, "dry_friction": FRICTION, "hysteresis": TORQUE,
@@ -48,7 +48,7 @@ def test_play_spring_and_slip_in_series(repeats):
     random = np.random.default_rng(46)
     for _ in range(repeats(3, 30)):
         x, force, truth = simulate_band(random)
-        fit = fit_element(RigLog(x, force, [slice(0, len(x))], PERIOD, 0.0), linear=True)
+        fit = fit_element(RigLog(x, force, [slice(0, len(x))], PERIOD, 0.0, "m"))
         assert set(fit.model.terms) == {"gap", "slip"} and not fit.open
         for name, value in truth.items():
             number = fit.numbers[name]
@@ -61,12 +61,12 @@ def test_a_shaft_is_a_shaft_and_one_way_says_nothing():
     random = np.random.default_rng(2)
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(2000))
     u = 3.0e4 * x + random.standard_normal(2000)
-    fit = fit_element(RigLog(x, u, [slice(0, 2000)], PERIOD, 0.0), linear=True)
+    fit = fit_element(RigLog(x, u, [slice(0, 2000)], PERIOD, 0.0, "m"))
     assert fit.model.terms == () and fit.numbers["stiffness"].unit == "N/m"
     low, high = fit.numbers["stiffness"].interval
     assert low < 3.0e4 < high < 1.01 * 3.0e4
     one_way = RigLog(0.001 * np.arange(500.0), np.arange(500.0), [slice(0, 500)], PERIOD, 0.0)
-    assert fit_element(one_way, linear=False) is None
+    assert fit_element(one_way) is None
 
 
 def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
@@ -75,5 +75,5 @@ def test_a_rest_behind_a_gap_of_a_long_log_is_left_out(monkeypatch):
     x = 0.01 * np.sin(2.0 * np.pi * 0.3 * PERIOD * np.arange(4003))
     u = 3.0e4 * x + np.random.default_rng(2).standard_normal(4003)
     for parts in ([slice(0, 4000), slice(4000, 4003)], [slice(0, 3), slice(3, 4003)]):
-        fit = fit_element(RigLog(x, u, parts, PERIOD, 0.0), linear=True)
+        fit = fit_element(RigLog(x, u, parts, PERIOD, 0.0, "m"))
         assert fit is not None and fit.numbers["stiffness"].value == pytest.approx(3.0e4, rel=0.01)
