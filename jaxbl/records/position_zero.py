@@ -63,10 +63,14 @@ class ZeroShift(NamedTuple):
 
 
 class _MovingRows(NamedTuple):
-    """Low-passed rows in motion: torque, acceleration and other columns, exp(i n position), n = 1, 2, ..."""
+    """Low-passed rows in motion.
 
-    torque: np.ndarray
-    columns: np.ndarray
+    Attributes:
+        signals: torque, acceleration, velocity, its sign, and with a load the twist and its rate, shape (rows, 4 or 6).
+        waves: exp(i n position), n = 1, 2, ..., shape (rows, waves).
+    """
+
+    signals: np.ndarray
     waves: np.ndarray
 
 
@@ -84,25 +88,20 @@ def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
     if turns * _MAX_HARMONIC < _MIN_PERIODS:
         return None
     lowest = int(np.ceil(_MIN_PERIODS / turns))
-    exchanged = _exchange_acceleration(first_rows), _exchange_acceleration(rows)
-    return _find_shift(first_rows, rows, lowest) or _find_shift(*exchanged, lowest)
+    # under a constant torque the acceleration shows what repeats with the turn
+    order = [1, 0, *range(2, rows.signals.shape[1])]
+    first_exchanged, exchanged = (log._replace(signals=log.signals[:, order]) for log in (first_rows, rows))
+    return _find_shift(first_rows, rows, lowest) or _find_shift(first_exchanged, exchanged, lowest)
 
 
-def _exchange_acceleration(rows: "_MovingRows") -> "_MovingRows":
-    """Exchange torque and acceleration: under a constant torque the acceleration shows what repeats with the turn."""
-    return rows._replace(torque=rows.columns[:, 0], columns=np.column_stack([rows.torque, rows.columns[:, 1:]]))
-
-
-def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int) -> ZeroShift | None:
+def _find_shift(first_rows: _MovingRows, rows: _MovingRows, lowest_wave: int) -> ZeroShift | None:
     """Find the shift of the second rows by the waves of the first, which are of `lowest_wave` periods a turn and more."""
     # a column that does not vary is a constant, and a torque that does not vary shows no waves
-    columns = np.column_stack([first_rows.torque, first_rows.columns])
-    varies = np.ptp(columns, axis=0) > 1e-6 * column_rms(columns)
-    if not varies[0]:
+    torque_varies, *varies = np.ptp(first_rows.signals, axis=0) > 1e-6 * column_rms(first_rows.signals)
+    if not torque_varies:
         return None
-    varies = varies[1:]
     # what does not repeat within the log, such as gravity over part of a turn, is no wave, and would be taken for one
-    motion, slow = first_rows.columns[:, varies], slice(lowest_wave - 1)
+    motion, slow = first_rows.signals[:, 1:][:, varies], slice(lowest_wave - 1)
     beside = np.column_stack([motion, _find_basis(first_rows.waves[:, slow])])
     waves, values = _find_waves(first_rows, beside, lowest_wave - 1)
     if not waves:
@@ -113,9 +112,10 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
     shifts = np.linspace(-np.pi, np.pi, 2 * (_SHIFTS_PER_PERIOD * int(harmonics.max()) // 2), endpoint=False)
     turns = np.exp(1j * harmonics[:, None] * shifts) * size[:, None]
     # what the motion takes is known by the first log, but for constants and what depends on the zero
-    torque = rows.torque - rows.columns[:, varies] @ values[: motion.shape[1]]
+    columns, constant = rows.signals[:, 1:], np.logical_not(varies)
+    torque = rows.signals[:, 0] - columns[:, varies] @ values[: motion.shape[1]]
     signals = np.column_stack([torque, (rows.waves[:, waves] @ turns).real])
-    residuals = fit_residual(signals, np.column_stack([rows.columns[:, ~varies], _find_basis(rows.waves[:, slow])]))
+    residuals = fit_residual(signals, np.column_stack([columns[:, constant], _find_basis(rows.waves[:, slow])]))
     # without waves, and with those at each shift
     residuals[:, 1:] -= residuals[:, :1]
     block_squares = np.array([np.sum(part**2, axis=0) for part in np.array_split(residuals, BLOCKS)])
@@ -142,13 +142,12 @@ def _find_shift(first_rows: "_MovingRows", rows: "_MovingRows", lowest_wave: int
 
 def _find_basis(waves: np.ndarray) -> np.ndarray:
     """Return orthonormal columns that span a constant and some waves, as far as numbers tell these apart."""
-    columns, sizes, _ = np.linalg.svd(
-        np.column_stack([np.ones(len(waves)), np.real(waves), np.imag(waves)]), full_matrices=False
-    )
-    return columns[:, sizes > 1e-6 * sizes[0]]
+    from scipy.linalg import orth
+
+    return orth(np.column_stack([np.ones(len(waves)), np.real(waves), np.imag(waves)]), rcond=1e-6)
 
 
-def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[list[int], np.ndarray]:
+def _find_waves(rows: _MovingRows, motion: np.ndarray, lowest: int) -> tuple[list[int], np.ndarray]:
     """Find the waves that a log surely shows, the one that takes away most first, and fit them beside the motion.
 
     All at once would not do: over a few turns neighbouring waves look alike.
@@ -160,11 +159,11 @@ def _find_waves(rows: "_MovingRows", motion: np.ndarray, lowest: int) -> tuple[l
     columns, values = motion, np.zeros(0)
     while len(waves) < _MOST_WAVES:
         basis = np.linalg.qr(columns)[0]
-        torque, candidates = (part - basis @ (basis.T @ part) for part in (rows.torque, rows.waves[:, lowest:]))
+        torque, candidates = (part - basis @ (basis.T @ part) for part in (rows.signals[:, 0], rows.waves[:, lowest:]))
         pairs = [np.linalg.qr(np.column_stack([wave.real, wave.imag]))[0] for wave in candidates.T]
         wave = lowest + int(np.argmax([np.sum((pair.T @ torque) ** 2) for pair in pairs]))
         columns = np.column_stack([columns, np.real(rows.waves[:, wave]), np.imag(rows.waves[:, wave])])
-        coefficients, errors = fit_with_jackknife(rows.torque, columns)
+        coefficients, errors = fit_with_jackknife(rows.signals[:, 0], columns)
         if not np.hypot(*(coefficients[-2:] / errors[-2:])) > _SURE_ERRORS:
             break
         waves, values = [*waves, wave], coefficients
@@ -176,29 +175,30 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     parts = []
     for s in long_segments(log.segments):
         place, velocity, acceleration = low_pass_motion(log.motor[s], cutoff, log.period)
-        columns = [acceleration, velocity, smooth_sign(velocity)]
+        held = log.torque[s]
+        torque = low_pass(0.5 * (np.append(held[:1], held[:-1]) + held), cutoff, log.period)
+        signals = [torque, acceleration, velocity, smooth_sign(velocity)]
         if log.load is not None:
             twist = place - low_pass(log.load[s], cutoff, log.period)
-            columns += [twist, np.gradient(twist, log.period)]
+            signals += [twist, np.gradient(twist, log.period)]
         # long logs: only as many samples as the low-pass needs
         inner = trim_filter_ends(len(place), cutoff, log.period)
         rows = slice(inner.start, inner.stop, max(int(0.1 / (cutoff * log.period)), 1))
         turns = (np.exp(1j * n * log.motor[s]) for n in range(1, _MAX_HARMONIC + 1))
         waves = np.stack([low_pass(turn, cutoff, log.period)[rows] for turn in turns], axis=1)
-        held = log.torque[s]
-        torque = low_pass(0.5 * (np.append(held[:1], held[:-1]) + held), cutoff, log.period)[rows]
-        parts.append((torque, np.column_stack(columns)[rows], waves))
+        parts.append((np.column_stack(signals)[rows], waves))
     if not parts:
         return None
-    signals = [np.concatenate(pieces) for pieces in zip(*parts, strict=True)]
-    speed = np.abs(signals[1][:, 1])
-    moving_rows = _MovingRows(*(signal[speed > MIN_SPEED_SHARE * rms(speed)] for signal in signals))
-    if len(moving_rows.torque) <= _MIN_ROWS:
+    signals, waves = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+    velocity = signals[:, 2]
+    is_moving = np.abs(velocity) > MIN_SPEED_SHARE * rms(velocity)
+    signals, waves = signals[is_moving], waves[is_moving]
+    if len(signals) <= _MIN_ROWS:
         return None
-    if np.ptp(np.sign(moving_rows.columns[:, 1])) == 0.0:
+    if np.ptp(np.sign(signals[:, 2])) == 0.0:
         # in one direction the sign of the velocity is a constant
-        moving_rows.columns[:, 2] = 1.0
-    return moving_rows
+        signals[:, 3] = 1.0
+    return _MovingRows(signals, waves)
 
 
 def _parabola_minimum(squares: np.ndarray) -> float:
