@@ -60,13 +60,13 @@ class BlockRegression:
 
     def select(self, columns: Sequence[int] | np.ndarray, fixed: Sequence[int] = ()) -> "BlockRegression":
         """Keep some columns; those whose coefficient is `fixed` at 1 are taken off the target."""
-        index = [*columns, *fixed, -1]
+        index, known = [*columns, *fixed, -1], slice(len(columns), -1)
         products = self.products[:, index][:, :, index]
-        for column in range(len(columns), len(index) - 1):
-            products[:, -1] -= products[:, column]
-            products[:, :, -1] -= products[:, :, column]
-        chosen = [*range(len(columns)), -1]
-        return BlockRegression(products[:, chosen][:, :, chosen], self.counts)
+        # each new column as a sum of these
+        sums = np.eye(len(index))
+        sums[known, -1] = -1.0
+        sums = np.delete(sums, known, axis=1)
+        return BlockRegression(sums.T @ products @ sums, self.counts)
 
     def fit(self, left_out: Sequence[int] | np.ndarray = ()) -> np.ndarray:
         """Fit the coefficients without some blocks; 0 of a column of zeros, the least ones where columns are alike."""

@@ -9,8 +9,6 @@ import numpy as np
 from .least_squares import BLOCKS, fit_with_jackknife, jackknife_variance, rms, student_interval
 from .signal_quality import MIN_SAMPLES
 
-Flank = Literal["motion", "load"]
-
 
 @dataclass(frozen=True)
 class LostMotion:
@@ -31,7 +29,7 @@ class LostMotion:
     lost_motion: float
     lost_motion_error: float
     lost_motion_interval: tuple[float, float]
-    flank: Flank
+    flank: Literal["motion", "load"]
     flank_changes: int
     flank_times: tuple[float, ...]
     lost_motion_range: tuple[float, float]
@@ -95,12 +93,11 @@ BINS = 60
 class _Cells:
     """Mean twist of each crossing of a place by a pass over the range, in the order of time.
 
-    `group` numbers the pairs of place and direction.
+    `group` numbers the pairs of place and direction: twice the place, and 1 more forwards.
     """
 
     twist: np.ndarray
     time: np.ndarray
-    place: np.ndarray
     pass_number: np.ndarray
     group: np.ndarray
 
@@ -129,8 +126,8 @@ def _average_passes(
     mean, when = (np.bincount(inverse, signal) / count for signal in (twist[moving], times))
     order = np.argsort(when)
     order = order[(count >= max(3, 0.1 * np.median(count)))[order]]
-    place, first = place[first[order]], first[order]
-    return _Cells(mean[order], when[order], place, pass_number[first], 2 * place + forwards[first])
+    first = first[order]
+    return _Cells(mean[order], when[order], pass_number[first], (2 * place + forwards)[first])
 
 
 def _shift_between_states(
@@ -226,7 +223,7 @@ def fit_lost_motion_by_load(
         return None
     variance, passes = 0.0, len(np.unique(cells.pass_number))
     # by passes, and by neighbouring places
-    for blocks in (cells.pass_number, cells.place // (BINS // BLOCKS)):
+    for blocks in (cells.pass_number, cells.group // (2 * BINS // BLOCKS)):
         without = [_shift_between_states(cells, state, blocks != block)[0] for block in np.unique(blocks)]
         finite = [value for value in without if math.isfinite(value)]
         if len(finite) < max(3, len(without) - 1):

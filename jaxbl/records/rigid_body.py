@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxbl.quantity import Quantity
-
 from .least_squares import column_rms, fit_with_jackknife, rms
 from .signal_quality import find_motion_bandwidth, long_segments, low_pass, low_pass_motion, trim_filter_ends
 
@@ -46,11 +44,9 @@ class RigidFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `inspection.json`."""
-        columns = (x.tolist() for x in (self.values, self.errors, self.inflation, self.shares))
-        terms = {
-            name: Quantity(value, error).to_dict() | {"inflation": inflation, "share": share}
-            for name, value, error, inflation, share in zip(self.names, *columns, strict=True)
-        }
+        keys = "value", "standard_error", "inflation", "share"
+        rows = np.stack([self.values, self.errors, self.inflation, self.shares], axis=1).tolist()
+        terms = {name: dict(zip(keys, row, strict=True)) for name, row in zip(self.names, rows, strict=True)}
         return {"terms": terms, "residual": self.residual}
 
 
@@ -83,11 +79,11 @@ def fit_rigid_drive(
         smooth_torque = low_pass(torque[segment], cutoff, period)
         # the slope of the torque takes a lateness of it
         slope = np.gradient(smooth_torque, period)
-        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), slope, smooth_torque]
+        columns = [acceleration, velocity, direction, smooth, np.ones_like(smooth), slope]
         if beside is not None:
             _, velocity, acceleration = low_pass_motion(beside[segment], cutoff, period)
-            columns[6:6] = acceleration, velocity, low_pass(smooth_sign(velocity), cutoff, period)
-        parts.append(np.stack(columns, axis=1)[trim_filter_ends(len(smooth), cutoff, period)])
+            columns += [acceleration, velocity, low_pass(smooth_sign(velocity), cutoff, period)]
+        parts.append(np.stack([*columns, smooth_torque], axis=1)[trim_filter_ends(len(smooth), cutoff, period)])
     if not parts:
         return None
     signals = np.concatenate(parts)

@@ -135,17 +135,13 @@ def saturated_share(values: np.ndarray, step: float) -> float:
     return saturated / len(values)
 
 
-def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray | None = None) -> int:
-    """Count isolated outliers and steps of a position: differences far off their neighbours, and more than 4.5 `step`.
-
-    Positions without `stamps` (s) are evenly spaced.
-    """
+def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray) -> int:
+    """Count isolated outliers and steps of a position at `stamps` (s): differences far off their neighbours, and more than
+    4.5 `step`."""
     from scipy.ndimage import median_filter, percentile_filter
 
-    differences = np.diff(positions)
-    if stamps is not None:
-        intervals = np.diff(stamps)
-        differences = differences * (np.median(intervals) / intervals)
+    intervals = np.diff(stamps)
+    differences = np.diff(positions) * (np.median(intervals) / intervals)
     deviation = np.abs(differences - median_filter(differences, 7, mode="nearest"))
     # spread of the motion nearby; the quantiles leave out an outlier or two
     high, low = (percentile_filter(differences, percent, 31, mode="nearest") for percent in (90, 10))

@@ -70,11 +70,11 @@ def test_jumps_stand_out_of_the_motion(step):
     motion = np.where(time < 2.0, motion, motion[2000] + 2.0 * np.abs((time - 2.0) % 1.0 - 0.5) - 1.0)
     motion[5500:] = motion[5500]
     stepped = np.round(motion / step) * step if step else motion
-    assert signal_quality.count_jumps(stepped, step) == 0
+    assert signal_quality.count_jumps(stepped, step, time) == 0
     for rows, size in ((700, 0.3), (1500, -0.2), (5800, 0.05)):
         stepped[rows] += size
     stepped[3300:] += 0.2
-    assert signal_quality.count_jumps(stepped, step) == 4
+    assert signal_quality.count_jumps(stepped, step, time) == 4
 
 
 def test_low_pass_has_no_delay():
