@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from scipy.special import chdtri, ndtri
 
 from jaxbl.chain import Experiment
@@ -18,8 +17,6 @@ from jaxbl.chain import Experiment
 from .free_parameters import FreeParameter, set_free_parameters
 from .trajectory import Fit, Windows, fit
 
-_Points = list[tuple[float, float]]
-"""Steps of theta from the best value, and the deviance there."""
 NORMAL = float(ndtri(0.975))
 """Standard errors on either side of a value that a 95 % interval reaches to."""
 LIMIT = float(chdtri(1.0, 0.05))
@@ -44,10 +41,15 @@ class Spread(NamedTuple):
         inflation: factor on the standard errors by the correlation of the residuals, shape (parameters,).
     """
 
-    covariance: Float[np.ndarray, "parameters parameters"]
-    information: Float[np.ndarray, "parameters parameters"]
+    covariance: np.ndarray
+    information: np.ndarray
     variance: float | np.floating
-    inflation: Float[np.ndarray, " parameters"]
+    inflation: np.ndarray
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard errors of theta, shape (parameters,)."""
+        return np.sqrt(np.diag(self.covariance))
 
     def with_error(self, *changes: np.ndarray) -> "Spread":
         """Count changes of theta, each of shape (parameters,), as further errors."""
@@ -88,8 +90,11 @@ def spread_of(
     plain, (sizes, ways) = invert(information), np.linalg.eigh(middle)
     # by a root of the middle: never negative, whatever rounding does
     half = plain @ (ways * np.sqrt(np.maximum(sizes, 0.0)))
-    covariance, inflation = without_gain(half @ half.T, plain)
-    return Spread(covariance, information, variance, inflation)
+    sandwich = half @ half.T
+    inflation = np.sqrt(np.maximum(np.diag(sandwich), np.finfo(float).tiny) / np.diag(plain))
+    # elimination of initial states leaves a little negative correlation behind: nothing to gain confidence from
+    more = np.maximum(1.0 / inflation, 1.0)
+    return Spread(sandwich * np.outer(more, more), information, variance, inflation * more)
 
 
 def invert(matrix: np.ndarray) -> np.ndarray:
@@ -100,16 +105,6 @@ def invert(matrix: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
     values = np.maximum(values, 1e-14 * len(values) * values[-1])
     return (vectors / values) @ vectors.T / np.outer(size, size)
-
-
-def without_gain(sandwich: np.ndarray, plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A covariance that counts the correlation of residuals, nowhere below the plain one, and the factor on its errors.
-
-    Elimination of initial states leaves a little negative correlation behind: nothing to gain confidence from.
-    """
-    inflation = np.sqrt(np.maximum(np.diag(sandwich), np.finfo(float).tiny) / np.diag(plain))
-    more = np.maximum(1.0 / inflation, 1.0)
-    return sandwich * np.outer(more, more), inflation * more
 
 
 def long_run(scores: np.ndarray, least: int = 1) -> np.ndarray:
@@ -187,48 +182,40 @@ def profile(
     """
     centre, covariance = best.theta, width.covariance
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
-    worth = float(width.variance) * width.inflation**2
-
-    def follow(i: int, sign: float) -> _Points:
-        step, direction = np.sqrt(LIMIT * covariance[i, i]), covariance[:, i] / covariance[i, i]
-        points = [(0.0, 0.0)]
-        for _ in range(_PASSES):
-            step = min(step, _FURTHEST)
-            theta = centre + sign * step * direction
-            model = set_free_parameters(experiment, [free[i]._replace(minimum=None)], theta[[i]])
-            end = fit(model, [*free[:i], *free[i + 1 :]], windows, np.delete(theta, i), _MOST_STEPS)
-            deviance = 2.0 * (end.cost - best.cost) / worth[i]
-            points.append((float(step), float(deviance)))
-            # the next fit starts where this one ended
-            direction = (np.insert(end.theta, i, theta[i]) - centre) / (sign * step)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                factor = np.sqrt(LIMIT / np.maximum(deviance, 0.0))
-            step *= np.clip(factor if np.isfinite(factor) else 0.3, 0.3, 3.0)
-        return points
-
-    return {
-        parameter.path: _gather_profile(parameter, centre[i], follow(i, -1.0), follow(i, 1.0))
-        for i, parameter in enumerate(free)
-    }
-
-
-def _gather_profile(parameter: FreeParameter, centre: float, below: _Points, above: _Points) -> Profile:
-    lower, upper = map(step_at_limit, (below, above))
-    points = sorted([(-step, d) for step, d in below] + above[1:])
-    low, high = (float(parameter.value(centre + step)) if np.isfinite(step) else step for step in (-lower, upper))
-    values = np.array([float(parameter.value(centre + step)) for step, _ in points])
-    return Profile(
-        (low if parameter.minimum is None else max(low, parameter.minimum), high), values, np.array([d for _, d in points])
-    )
+    worth, profiles = float(width.variance) * width.inflation**2, {}
+    for i, parameter in enumerate(free):
+        ends, tried = [], [(0.0, 0.0)]
+        for sign in (-1.0, 1.0):
+            step, direction = np.sqrt(LIMIT * covariance[i, i]), covariance[:, i] / covariance[i, i]
+            points = [(0.0, 0.0)]
+            for _ in range(_PASSES):
+                step = min(step, _FURTHEST)
+                theta = centre + sign * step * direction
+                model = set_free_parameters(experiment, [parameter._replace(minimum=None)], theta[[i]])
+                end = fit(model, [*free[:i], *free[i + 1 :]], windows, np.delete(theta, i), _MOST_STEPS)
+                deviance = 2.0 * (end.cost - best.cost) / worth[i]
+                points.append((step, deviance))
+                # the next fit starts where this one ended
+                direction = (np.insert(end.theta, i, theta[i]) - centre) / (sign * step)
+                # rounding may leave less than none, and a fit that diverged no number
+                factor = np.sqrt(LIMIT / deviance) if deviance > 0.0 else 0.3
+                step *= np.clip(factor, 0.3, 3.0)
+            reach = sign * step_at_limit(points)
+            ends.append(float(parameter.value(centre[i] + reach)) if np.isfinite(reach) else reach)
+            tried += [(sign * step, deviance) for step, deviance in points[1:]]
+        low = ends[0] if parameter.minimum is None else max(ends[0], parameter.minimum)
+        steps, deviances = np.array(sorted(tried)).T
+        profiles[parameter.path] = Profile((low, ends[1]), parameter.value(centre[i] + steps), deviances)
+    return profiles
 
 
-def step_at_limit(points: _Points) -> float:
-    """Step at which the root of the deviance, which is nearly straight, reaches that of its limit, :data:`LIMIT`."""
-    steps, roots = (np.array(x) for x in zip(*sorted((s, np.sqrt(max(d, 0.0))) for s, d in points), strict=True))
-    goal = np.sqrt(LIMIT)
+def step_at_limit(points: list[tuple[float, float]]) -> float:
+    """Step of theta at which the root of the deviance, which is nearly straight, reaches that of its limit, :data:`LIMIT`;
+    from steps and the deviances there."""
+    steps, deviances = np.array(sorted(points)).T
+    roots, goal = np.sqrt(np.maximum(deviances, 0.0)), np.sqrt(LIMIT)
     beyond = np.flatnonzero(roots >= goal)
     if len(beyond) == 0:
         return np.inf if steps[-1] >= _FURTHEST else float(steps[-1] * goal / max(roots[-1], 1e-9))
-    first = int(beyond[0])
-    share = (goal - roots[first - 1]) / (roots[first] - roots[first - 1])
-    return float(steps[first - 1] + share * (steps[first] - steps[first - 1]))
+    around = slice(beyond[0] - 1, beyond[0] + 1)
+    return float(np.interp(goal, roots[around], steps[around]))

@@ -46,23 +46,29 @@ def refine_steps(
     """
     study_windows, best, change, left, excess = windows, first, np.zeros(len(free)), np.zeros(len(free)), 0.0
     steps = study_steps = experiment.run.substeps
-    for fits_left in reversed(range(_FITS)):
-        deviation = np.sqrt(np.diag(spread(best).covariance))
+
+    def simulate(steps: int) -> np.ndarray:
+        """Positions of the best fit over the noise with so many plant steps in a sample, shape (windows, samples, sides)."""
         model = set_free_parameters(experiment, free, best.theta)
+        model = replace(model, run=replace(model.run, substeps=steps))
+        return positions_over_noise(model, windows, simulate_windows(model, windows, best.start).position)
+
+    for fits_left in reversed(range(_FITS)):
+        deviation = spread(best).deviations
         jacobian = best.jacobian.reshape(-1, len(free))
         normal = jacobian.T @ jacobian + np.eye(len(free)) / PRIOR_DEVIATION**2
         # of what diverges nothing is finite, and finer steps are of no help
         with np.errstate(all="ignore"):
-            coarse = fine = _simulate(model, windows, best, study_steps)
+            coarse = fine = simulate(study_steps)
             while True:
-                half = _simulate(model, windows, best, 2 * steps)
+                half = simulate(2 * steps)
                 left = np.linalg.solve(normal, jacobian.T @ (half - fine).ravel())
                 excess = float(np.max(np.abs(left) / deviation)) / _SHARE
                 if not excess > 1.0 or steps >= _MOST:
                     break
                 # errors fall with the square of the steps
                 steps = min(steps * 2 ** int(np.ceil(0.5 * np.log2(excess) + 1e-9)), _MOST)
-                fine = _simulate(model, windows, best, steps)
+                fine = simulate(steps)
         if steps == study_steps:
             return windows, best, [], steps
         finer = half - coarse
@@ -77,9 +83,3 @@ def refine_steps(
                 return study_windows, first, [change], study_steps
     # by the order of the steps, a third of the last change is left
     return windows, best, [change, left / 3.0] if excess > 1.0 else [change], 2 * steps
-
-
-def _simulate(model: Experiment, windows: Windows, fit: Fit, steps: int) -> np.ndarray:
-    """Positions over the noise with so many plant steps in a sample, shape (windows, samples, sides)."""
-    model = replace(model, run=replace(model.run, substeps=steps))
-    return positions_over_noise(model, windows, simulate_windows(model, windows, fit.start).position)

@@ -9,12 +9,11 @@ References: L. Ljung, System Identification (1999), 7.4, 7.5; Y. Bar-Shalom, X.-
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from jaxbl.chain import Experiment, NamedArrays
+from jaxbl.chain import Experiment
 from jaxbl.drive.effects import Numbers
 
 from .trajectory import Windows, eliminate_starts
@@ -36,32 +35,26 @@ def kalman_gain(smoothness: float, period: float) -> np.ndarray:
     return covariance[:, 0] / (covariance[0, 0] + 1.0) * np.array([1.0, 1.0 / period])
 
 
-def _sizes(experiment: Experiment, windows: Windows, gain: NamedArrays) -> np.ndarray:
-    """Rms prediction error of each side in rad under a gain."""
+def _predict(experiment: Experiment, windows: Windows, smoothness: Numbers) -> Windows:
+    """The windows with the gain of each side's smoothness, and the rms prediction errors under it, rad, as noise."""
+    period = float(experiment.run.sample_period)
+    gain = {side: kalman_gain(value, period) for side, value in smoothness.items()}
     residual = eliminate_starts(experiment, replace(windows, gain=gain)).residual
-    return np.array([windows.noise[side] for side in experiment.sides]) * np.sqrt(np.mean(residual**2, axis=(0, 1)))
+    errors = np.sqrt(np.mean(residual**2, axis=(0, 1)))
+    noise = {side: windows.noise[side] * error for side, error in zip(experiment.sides, errors, strict=True)}
+    return replace(windows, gain=gain, noise=noise)
 
 
 def predictor(experiment: Experiment, windows: Windows) -> tuple[Windows, Numbers]:
     """The windows with the gain whose prediction errors are least, and their size as noise; each side's q h^3 / sigma^2."""
-    period = float(experiment.run.sample_period)
-    count = len(windows.time)
-    # of an earlier choice
-    windows = replace(windows, gain=None)
-    few = windows.only(np.unique(np.linspace(0, count - 1, min(count, _MOST_WINDOWS)).astype(int)))
+    few = windows.some(_MOST_WINDOWS)
 
-    def gains_of(smoothness: Numbers) -> dict[str, Any]:
-        return {side: kalman_gain(value, period) for side, value in smoothness.items()}
+    @np.errstate(divide="ignore")
+    def measure(smoothness: Numbers) -> float:
+        total = np.sum(np.log([*_predict(experiment, few, smoothness).noise.values()]))
+        return total if np.isfinite(total) else np.inf
 
-    def best(candidates: list[Numbers]) -> Numbers:
-        sizes = np.array([_sizes(experiment, few, gains_of(smoothness)) for smoothness in candidates])
-        with np.errstate(divide="ignore"):
-            total = np.sum(np.log(sizes), axis=1)
-        return candidates[int(np.argmin(np.where(np.isfinite(total), total, np.inf)))]
-
-    chosen = best([dict.fromkeys(experiment.sides, float(x)) for x in _COARSE])
+    chosen = min((dict.fromkeys(experiment.sides, float(x)) for x in _COARSE), key=measure)
     for side in experiment.sides:
-        chosen = best([chosen | {side: float(chosen[side] * x)} for x in _FINE])
-    gain = gains_of(chosen)
-    size = _sizes(experiment, windows, gain)
-    return replace(windows, gain=gain, noise=dict(zip(experiment.sides, size, strict=True))), chosen
+        chosen = min([chosen | {side: float(chosen[side] * x)} for x in _FINE], key=measure)
+    return _predict(experiment, windows, chosen), chosen

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -40,7 +39,7 @@ def is_noise(residual: Mapping[str, float]) -> bool:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class SearchFit:
     """A fit to all of a log.
 
     Attributes:
@@ -53,6 +52,10 @@ class Fitted:
         steps: plant steps in a sample.
         errors: of theta, that finer steps or windows of another length show, each of shape (parameters,).
         between: by how much theta differs between the window lengths that were tried; None if there was one.
+        refused: directions that the record does not show.
+        held: numbers that were left at their nominal values therefore.
+        condition: of the information about all numbers asked for.
+        starts: whether each start agrees with the best.
     """
 
     free: tuple[FreeParameter, ...]
@@ -64,36 +67,20 @@ class Fitted:
     steps: int
     errors: Sequence[np.ndarray] = ()
     between: np.ndarray | None = None
+    refused: Sequence[Refusal] = ()
+    held: Sequence[str] = ()
+    condition: float = np.nan
+    starts: Sequence[bool] = ()
 
     @property
     def samples(self) -> int:
         """Length of a window."""
         return self.windows.torque.shape[1]
 
-
-@dataclass(frozen=True, kw_only=True)
-class SearchFit(Fitted):
-    """The fit that was kept, of the numbers that the log shows.
-
-    Attributes:
-        refused: directions that the record does not show.
-        held: numbers that were left at their nominal values therefore.
-        condition: of the information about all numbers asked for.
-        starts: whether each start agrees with the best.
-    """
-
-    refused: list[Refusal]
-    held: list[str]
-    condition: float
-    starts: list[bool]
-
-
-def _nearest_turn(free: Sequence[FreeParameter], theta: np.ndarray) -> np.ndarray:
-    """Theta with phases within half a turn of their nominal values."""
-    turns = np.array(
-        [np.round(x / (2.0 * np.pi)) if parameter.role == "angle" else 0.0 for parameter, x in zip(free, theta, strict=True)]
-    )
-    return theta - 2.0 * np.pi * turns
+    @property
+    def openness(self) -> float:
+        """Logarithm of how much of the numbers is left open; not finite where the model diverges."""
+        return float(2.0 * np.sum(np.log(self.spread.deviations)))
 
 
 @dataclass(frozen=True)
@@ -114,7 +101,7 @@ class ParameterSearch:
     at_rest: bool
     name: str
 
-    @cached_property
+    @property
     def lengths(self) -> list[int]:
         """Samples of the windows that are tried.
 
@@ -153,20 +140,15 @@ class ParameterSearch:
             free, theta = tuple(itertools.compress(free, is_free)), theta[is_free]
             best = self._whole(free, theta)
             left, _ = refusals(best.free, best.spread)
-        return SearchFit(**vars(best), refused=refused, held=held, condition=condition, starts=starts)
-
-    def _cut(self, samples: int) -> tuple[Windows, np.ndarray]:
-        return windows_of(self.segments, self.experiment, samples, self.at_rest)
+        return replace(best, refused=refused, held=held, condition=condition, starts=starts)
 
     def _coarse(self, free: tuple[FreeParameter, ...]) -> tuple[np.ndarray, list[bool]]:
-        """Best of several starts, on short windows from all over the record.
+        """Best of several starts, on short windows from all over the record; phases within half a turn of nominal ones.
 
         Starts agree with it whose costs are at most 1 % larger; of the cost of noise alone, if that is more.
         """
-        windows, _ = self._cut(self.lengths[0])
-        count = len(windows.time)
-        if count > _MOST_COARSE:
-            windows = windows.only(np.linspace(0, count - 1, _MOST_COARSE).astype(int))
+        windows, _ = windows_of(self.segments, self.experiment, self.lengths[0], self.at_rest)
+        windows = windows.some(_MOST_COARSE)
         random = np.random.default_rng(self.settings.seed)
         reach = np.log(self.settings.spread)
         thetas = np.zeros((self.settings.starts, len(free)))
@@ -179,13 +161,14 @@ class ParameterSearch:
         best = int(np.argmin(cost))
         # fits end where they change residuals by little beside the noise: without noise, costs may be any times one another
         same = cost[best] + 0.01 * max(cost[best], tries[best].residual.size / 2)
-        return _nearest_turn(free, tries[best].theta), (cost <= same).tolist()
+        theta, is_angle = tries[best].theta, np.array([parameter.role == "angle" for parameter in free])
+        return theta - 2.0 * np.pi * np.round(theta / (2.0 * np.pi)) * is_angle, (cost <= same).tolist()
 
-    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray) -> Fitted:
+    def _whole(self, free: tuple[FreeParameter, ...], theta: np.ndarray) -> SearchFit:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
-        sized: list[tuple[float, Fitted]] = []
+        fits: list[SearchFit] = []
         for samples in self.lengths:
-            windows, firsts = self._cut(samples)
+            windows, firsts = windows_of(self.segments, self.experiment, samples, self.at_rest)
             smoothness: dict[str, float] = {}
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
@@ -194,18 +177,17 @@ class ParameterSearch:
             end = fit(self.experiment, free, windows, theta)
             windows, end, errors, steps = refine_steps(self.experiment, free, windows, end)
             width = spread(end).with_error(*errors)
-            size = float(np.sum(np.log(np.diag(width.covariance))))
-            if np.isfinite(size):
-                sized.append((size, Fitted(free, end, width, windows, firsts, smoothness, steps, errors)))
-        if not sized:
+            fits.append(SearchFit(free, end, width, windows, firsts, smoothness, steps, errors))
+        fits = [candidate for candidate in fits if np.isfinite(candidate.openness)]
+        if not fits:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")
-        growth = sized[-1][1].spread.variance / sized[0][1].spread.variance - 1.0
-        best, *runners_up = [candidate for _, candidate in sorted(sized, key=lambda pair: pair[0])]
+        growth = fits[-1].spread.variance / fits[0].spread.variance - 1.0
+        best, *runners_up = sorted(fits, key=lambda candidate: candidate.openness)
         grows = growth > _SURE * np.sqrt(2.0 / best.fit.residual.size)
         return _between(best, runners_up[0], grows) if runners_up else best
 
 
-def _between(best: Fitted, other: Fitted, grows: bool) -> Fitted:
+def _between(best: SearchFit, other: SearchFit, grows: bool) -> SearchFit:
     """Count what another window length would have said, where the model leaves more than noise, or the longer windows leave
     more than the shorter ones (`grows`).
 

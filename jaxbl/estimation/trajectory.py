@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
 
 from jaxbl.chain import Experiment, PlantState, correct_by_readings
 from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivatives
@@ -24,10 +23,6 @@ from jaxbl.fused.single_plant import Direction, simulate_plants, step_derivative
 from .descent import descend, linearise
 from .free_parameters import PRIOR_DEVIATION, FreeParameter, set_free_parameters
 
-Residuals = Float[np.ndarray, "windows samples sides"]
-"""Of positions over the noise."""
-Theta = Float[np.ndarray, " parameters"]
-"""Coordinates of the free parameters."""
 _INNER, _OUTER = 2, 12
 """Initial states tried for a window at each step of the fit; and where they are sought anew."""
 RIDGE = 1e-10
@@ -56,25 +51,30 @@ class Windows(eqx.Module):
         noise: standard deviation of each side's readings (of its prediction errors, with a gain), rad.
         at_rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
         finer: what finer plant steps than the experiment's add to the simulated positions, over the noise
-            (:mod:`.plant_steps`).
+            (:mod:`.plant_steps`), shape (windows, samples, sides).
         gain: of the predictor (:func:`jaxbl.chain.plant_trajectory`) of each side, shape (2,);
             None: free runs, output error.
     """
 
-    torque: Float[np.ndarray, "windows samples"]
-    measured: dict[str, Float[np.ndarray, "windows samples"]]
-    time: Float[np.ndarray, " windows"]
+    torque: np.ndarray
+    measured: dict[str, np.ndarray]
+    time: np.ndarray
     start: PlantState
     noise: dict[str, float]
-    at_rest: Bool[np.ndarray, " windows"]
-    finer: Residuals
-    gain: dict[str, Float[np.ndarray, " 2"]] | None = None
+    at_rest: np.ndarray
+    finer: np.ndarray
+    gain: dict[str, np.ndarray] | None = None
 
     def only(self, places: np.ndarray | slice) -> "Windows":
         """Some of the windows."""
         # by NumPy: without a compiled program for each length
         columns, common = eqx.partition(self, _IN_COLUMNS)
         return eqx.combine(jax.tree.map(lambda column: np.asarray(column)[places], columns), common)
+
+    def some(self, most: int) -> "Windows":
+        """At most so many of the windows, spread over the record."""
+        count = len(self.time)
+        return self.only(np.linspace(0, count - 1, min(count, most)).astype(int))
 
     @staticmethod
     def join(parts: Sequence["Windows"]) -> "Windows":
@@ -99,10 +99,10 @@ class Fit(NamedTuple):
         converged: whether the solver met its tolerance.
     """
 
-    theta: Theta
+    theta: np.ndarray
     start: PlantState
-    residual: Residuals
-    jacobian: Float[np.ndarray, "windows samples sides parameters"]
+    residual: np.ndarray
+    jacobian: np.ndarray
     converged: bool
 
     @property
@@ -120,12 +120,6 @@ def simulate_windows(experiment: Experiment, windows: Windows, start: PlantState
 def positions_over_noise(experiment: Experiment, windows: Windows, positions: Mapping[str, Any]) -> np.ndarray:
     """Positions of the sides over the noise, shape (windows, samples, sides)."""
     return np.stack([positions[side] / windows.noise[side] for side in experiment.sides], axis=-1)
-
-
-def _leave(experiment: Experiment, windows: Windows, states: PlantState) -> np.ndarray:
-    """Residuals over the noise of simulated states."""
-    measured, simulated = (positions_over_noise(experiment, windows, x) for x in (windows.measured, states.position))
-    return measured - simulated - windows.finer
 
 
 def _differentiate(
@@ -202,15 +196,15 @@ def seek_starts(
     (runs, samples), count = windows.torque.shape, len(leaves)
     best = np.stack([np.broadcast_to(leaf, runs) for leaf in leaves], axis=1).astype(float)
     moving = [places.velocity[side] for side in experiment.sides]
-    still, fitted = best.copy(), np.ones_like(best)
+    still, fitted = best.copy(), np.ones(best.shape, bool)
     still[:, moving] = 0.0
-    fitted[np.ix_(np.flatnonzero(windows.at_rest), moving)] = 0.0
+    fitted[:, moving] = ~windows.at_rest[:, None]
     for effect, state in zip(experiment.effects, places.effects, strict=True):
         # others follow from numbers that are still to be fitted
         is_known = effect.state_from_input | (known_before & effect.state_from_measurement)
-        fitted[np.ix_(np.flatnonzero(np.broadcast_to(is_known, runs)), jax.tree.leaves(state))] = 0.0
+        fitted[:, jax.tree.leaves(state)] = ~np.reshape(is_known, (-1, 1))
     residual = np.zeros((runs, samples, len(moving)))
-    slope, states = np.zeros((*residual.shape, count)), [np.zeros((runs, samples)) for _ in leaves]
+    slope, states = np.zeros((*residual.shape, count)), np.zeros((count, runs, samples))
     following, going = best.copy(), np.ones(runs, bool)
     damping, cost = np.full(runs, RIDGE), np.full(runs, np.inf)
     for i in range(passes):
@@ -222,17 +216,16 @@ def seek_starts(
             continue
         part = windows.only(indices)
         along = simulate_windows(experiment, part, shape.unflatten(list(following[indices].T)))
-        value = _leave(experiment, part, along)
+        measured, simulated = (positions_over_noise(experiment, part, x) for x in (part.measured, along.position))
+        value = measured - simulated - part.finer
         squares = np.sum(value[:, :fitted_samples] ** 2, axis=(1, 2))
         better = (squares < cost[indices]) | ~np.isfinite(cost[indices])
-        damping[indices] = np.where(
-            better, np.maximum(0.01 * damping[indices], RIDGE), np.maximum(30.0 * damping[indices], 1e-2)
-        )
+        damping[indices] *= np.where(better, 0.01, 30.0)
+        damping[indices] = np.maximum(damping[indices], np.where(better, RIDGE, 1e-2))
         new, along = indices[better], jax.tree.map(lambda leaf, better=better: leaf[better], along)
         if len(new):
             best[new], cost[new], residual[new] = following[new], squares[better], value[better]
-            for stored, leaf in zip(states, jax.tree.leaves(along), strict=True):
-                stored[new] = leaf
+            states[:, new] = jax.tree.leaves(along)
             slope[new] = _differentiate(experiment, (), np.empty(0), part.only(better), along) * fitted[new][:, None, None]
         unit, size = over_size(slope[indices][:, :fitted_samples])
         towards = unit.swapaxes(1, 2) @ residual[indices][:, :fitted_samples].reshape(len(indices), -1, 1)
@@ -240,7 +233,7 @@ def seek_starts(
         change = np.linalg.solve(matrix, towards)
         following[indices] = best[indices] - change[:, :, 0] / size
         going[indices] = ~(np.sum(change * towards, axis=(1, 2)) <= _SETTLED * cost[indices])
-    return Starts(residual, slope, shape.unflatten(states))
+    return Starts(residual, slope, shape.unflatten(list(states)))
 
 
 def over_size(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -381,16 +374,16 @@ def cut(
     time of the first sample, s; `at_rest` says whether the part begins at rest.
     """
     count = len(torque) // samples
-    standing = np.arange(count) == (0 if at_rest else -1)
-    start = jax.tree.map(lambda x: np.asarray(x)[: count * samples : samples], start)
-    still = jax.tree.map(lambda x: np.where(standing, 0.0, x), start.velocity)
 
     def split(values: Any) -> Any:
         return np.asarray(values)[: count * samples].reshape(count, samples)
 
+    standing = np.arange(count) == (0 if at_rest else -1)
+    start = jax.tree.map(lambda x: split(x)[:, 0], start)
+    still = jax.tree.map(lambda x: np.where(standing, 0.0, x), start.velocity)
     return Windows(
         torque=split(torque),
-        measured={side: split(values) for side, values in measured.items()},
+        measured=jax.tree.map(split, measured),
         time=first + period * samples * np.arange(count),
         start=PlantState(start.position, still, start.effects),
         noise=noise,
