@@ -37,15 +37,13 @@ def find_feedback_bias(record: Record, segments: Sequence[Segment], fitted: Expe
     parts = [segment for segment in segments if len(segment) > 4 * _EDGE]
     if record.reference is None or not parts:
         return {}
-    period, bias_by_side = record.sample_period, {}
+    period, bias_by_side, motions = record.sample_period, {}, [part.kinematics for part in parts]
     velocities = [np.gradient(record.reference[part.rows], period) for part in parts]
     inside = slice(_EDGE, -_EDGE)
-    instruments = np.concatenate([np.stack([np.gradient(v, period), v], 1)[inside] for v in velocities])
-    balances = [balance(fitted, part.kinematics) for part in parts]
+    instruments = np.concatenate([np.column_stack([np.gradient(v, period), v])[inside] for v in velocities])
+    balances = [balance(fitted, k) for k in motions]
     for side in fitted.sides:
-        motion = np.concatenate(
-            [np.stack([k.acceleration[side], k.velocity[side]], 1)[inside] for k in (part.kinematics for part in parts)]
-        )
+        motion = np.concatenate([np.column_stack([k.acceleration[side], k.velocity[side]])[inside] for k in motions])
         residual = np.concatenate([np.asarray(equations[side].residual)[inside] for equations in balances])
         product = instruments.T @ motion
         if np.linalg.matrix_rank(product) < 2:

@@ -76,18 +76,17 @@ def gains_for(
     if not sides:
         return {}, {}
     part = max(segments, key=len)[:_MOST]
-    k, count = part.kinematics, len(part)
-    ends = slice(min(20, count // 10), count - min(20, count // 10))
-    (alpha, factor), least = (x.ravel() for x in np.meshgrid(_ALPHA, _LAMBDA)), np.tile(_LEAST_LAMBDA, len(_LAMBDA))
+    k, end = part.kinematics, min(20, len(part) // 10)
+    alpha, lambda_ = np.tile(_ALPHA, len(_LAMBDA)), np.outer(_LAMBDA, _LEAST_LAMBDA).ravel()
     # of NumPy: arithmetic alone is no program then
     drive = jax.tree.map(np.asarray, experiment.drive)
     f_plus, candidates = {}, {}
     for side in experiment.sides:
         # acceleration that the observer's nominal model does not explain
         disturbance = k.acceleration[side] - drive.acceleration(side, k.velocity[side], k.torque)
-        f_plus[side] = float(np.max(np.abs(disturbance[ends])))
+        f_plus[side] = float(np.max(np.abs(disturbance[end : len(part) - end])))
         bound = max(f_plus[side], np.finfo(float).tiny)
-        candidates[f"observer.{side}.lambda"] = factor * least * np.sqrt(bound)
+        candidates[f"observer.{side}.lambda"] = lambda_ * np.sqrt(bound)
         candidates[f"observer.{side}.alpha"] = alpha * bound
 
     missed = _misses(experiment, k, candidates, part.readings)
@@ -97,8 +96,7 @@ def gains_for(
         size = np.where(np.isfinite(size), size, np.inf)
         # several do exactly the same where noise is fine: the first of them, whatever rounding says
         best = int(np.argmax(size <= (1.0 + 1e-9) * np.min(size)))
-        chosen = {path: float(column[best]) for path, column in candidates.items() if path.startswith(f"observer.{side}.")}
-        lambda_, alpha_ = chosen.values()
-        gains[side] = ChosenGains(lambda_, alpha_, f_plus[side], float(size[best]))
+        chosen = {path: float(candidates[path][best]) for path in (f"observer.{side}.lambda", f"observer.{side}.alpha")}
+        gains[side] = ChosenGains(*chosen.values(), f_plus=f_plus[side], velocity_error=float(size[best]))
         values |= chosen
     return gains, values

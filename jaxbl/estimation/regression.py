@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import AbstractEffect
-from jaxbl.drive.plant import EffectStates, Plant
+from jaxbl.drive.plant import EffectStates, Plant, PlantState
 from jaxbl.fused.compilation import jit
-from jaxbl.records.least_squares import BlockRegression
+from jaxbl.records.least_squares import BlockRegression, mean_error
 
 Samples = Float[Array, " samples"]
 SideSamples = dict[str, Samples]
@@ -66,13 +66,13 @@ def kinematics_from(
     The input torque is held from each sample to the next; `states` are position, velocity and acceleration of each side,
     shape (samples, 3). `before`: input before the first sample, N m, shape (earlier,), where it is known.
     """
-    earlier = 0 if before is None else len(before)
-    held = torque if before is None else np.concatenate([before, torque])
-    mean = 0.5 * (np.append(held[:1], held[:-1]) + held)
+    before = np.empty(0) if before is None else before
+    held = np.concatenate([before, torque])
+    earlier, mean = np.split(0.5 * (np.append(held[:1], held[:-1]) + held), [len(before)])
     motion: list[Any] = [{side: np.ascontiguousarray(state[:, i]) for side, state in states.items()} for i in range(3)]
     # arrays of numpy go where those of jax are asked for
-    arrays: list[Any] = [time, mean[earlier:], *motion, transmitted]
-    return Kinematics(*arrays, before=mean[:earlier] if earlier else None)  # pyright: ignore[reportArgumentType]
+    arrays: list[Any] = [time, mean, *motion, transmitted]
+    return Kinematics(*arrays, before=earlier if len(earlier) else None)  # pyright: ignore[reportArgumentType]
 
 
 class Balance(NamedTuple):
@@ -94,13 +94,11 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
     """
     plant, drive, k = experiment.plant, experiment.drive, kinematics
     states, torque = effect_path(experiment, k)
-    balances = {}
-    if k.transmitted is not None and plant.transmission is not None:
-        balances["transmission"] = Balance(k.transmitted - _transmit(plant, k, states), k.transmitted)
+    balances, through = {}, None if plant.transmission is None else transmit(plant, k, states)
+    if k.transmitted is not None and through is not None:
+        balances["transmission"] = Balance(k.transmitted - through, k.transmitted)
+    through = through if k.transmitted is None else k.transmitted
     acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, k.transmitted)
-    through = k.transmitted
-    if through is None and plant.transmission is not None:
-        through = _transmit(plant, k, states)
     for side, (total, level) in acting.items():
         resisting = drive.viscous(side) * k.velocity[side] + level * jnp.sign(k.velocity[side])
         driving = torque if side == "motor" or through is None else drive.torque_gain(side) * through
@@ -118,20 +116,20 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
     states, torque = effect_path(experiment, k)
     loaded: Any = 0.0
     if plant.transmission is not None:
-        torques["transmission"] = _transmit(plant, k, states)
+        torques["transmission"] = transmit(plant, k, states)
         loaded = plant.gear_friction(states, torques["transmission"])
     none = jnp.zeros_like(k.torque)
     acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, none)
     places = {plant.drive.resolve_place(effect.place) for effect in plant.effects}
-    if not isinstance(loaded, float):
+    if "actuator" in places or not isinstance(loaded, float):
         places.add("motor")
     for side, (total, level) in acting.items():
-        if side in places or (side == "motor" and "actuator" in places):
-            direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
-            added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
-            commanded = k.torque if side == "motor" else 0.0
-            level = level + (loaded if side == "motor" else 0.0)
-            torques[side] = level * direction + commanded - total + added
+        if side not in places:
+            continue
+        commanded, more = (k.torque, loaded) if side == "motor" else (0.0, 0.0)
+        direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
+        added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
+        torques[side] = (level + more) * direction + commanded - total + added
     return torques
 
 
@@ -139,10 +137,11 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
 def find_transmitted(experiment: Experiment, k: Kinematics) -> Samples:
     """Transmitted torque by a model at known kinematics, N m."""
     gear = with_effects(experiment, tuple(effect for effect in experiment.effects if effect.place == "transmission"))
-    return _transmit(gear.plant, k, effect_path(gear, k)[0])
+    return transmit(gear.plant, k, effect_path(gear, k)[0])
 
 
-def _transmit(plant: Plant, k: Kinematics, states: EffectStates) -> Samples:
+def transmit(plant: Plant, k: Kinematics | PlantState, states: EffectStates) -> Samples:
+    """Transmitted torque along a motion with these states of effects, N m."""
     return jax.vmap(plant.transmitted_torque)(k.position, k.velocity, states)[0]
 
 
@@ -150,6 +149,12 @@ def settle_states(experiment: Experiment, torque: Float[Array, ""]) -> EffectSta
     """The effects' own states after an input (N m) that has lasted."""
     # as of their classes: of a method of a module equinox makes a module
     return tuple(type(effect).settled(effect, torque) for effect in experiment.effects)
+
+
+def _receive(plant: Plant, states: EffectStates, torque: Array, period: Any) -> tuple[EffectStates, Array]:
+    """The effects' own states once an input (N m) has arrived, and the torque that acts."""
+    new, arriving = plant.receive(states, torque, period)
+    return plant.actuate(new, arriving(0.0, period), period)
 
 
 def remembers_input(effect: AbstractEffect) -> bool:
@@ -179,11 +184,7 @@ def begin_states(
     if before is None or not any(map(remembers_input, plant.effects)):
         return start
 
-    def sample(states: EffectStates, torque: Array) -> tuple[EffectStates, None]:
-        new, arriving = plant.receive(states, torque, period)
-        return plant.actuate(new, arriving(0.0, period), period)[0], None
-
-    return jax.lax.scan(sample, start, before)[0]
+    return jax.lax.scan(lambda states, torque: (_receive(plant, states, torque, period)[0], None), start, before)[0]
 
 
 @jit
@@ -198,21 +199,18 @@ def effect_path(experiment: Experiment, path: Path, from_rest: bool = False) -> 
         else state
         for effect, state in zip(plant.effects, begin_states(experiment, path.torque, path.before, from_rest), strict=True)
     )
-    moving = any(effect.place == "actuator" for effect in plant.effects) or plant.has_memory
-    if not moving:
+    if not plant.has_memory and all(effect.place != "actuator" for effect in plant.effects):
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(path.torque), *x.shape)), start), path.torque
-    # memory follows the way covered
-    steps = {side: jnp.diff(x, append=x[-1:]) / period for side, x in path.position.items()} if plant.has_memory else {}
-    motion = (path.time, path.position, steps) if plant.has_memory else None
+    motion = ()
+    if plant.has_memory:
+        # memory follows the way covered
+        steps = {side: jnp.diff(x, append=x[-1:]) / period for side, x in path.position.items()}
+        motion = path.position, steps, path.time
 
     def sample(states: EffectStates, row: tuple[Any, Any]) -> tuple[EffectStates, tuple[EffectStates, Array]]:
         torque, motion = row
-        new, arriving = plant.receive(states, torque, period)
-        new, acting = plant.actuate(new, arriving(0.0, period), period)
-        if motion is not None:
-            time, position, rate = motion
-            new = plant.advance_effects(new, position, rate, time, period)
-        return new, (states, acting)
+        new, acting = _receive(plant, states, torque, period)
+        return plant.advance_effects(new, *motion, step=period) if motion else new, (states, acting)
 
     return jax.lax.scan(sample, start, (path.torque, motion))[1]
 
@@ -234,11 +232,9 @@ def decimate(values: Samples, factor: int) -> Float[Array, " less"]:
 
 def decimate_balances(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, Balance]:
     """Equations of motion after decimation, all parts one after the other."""
-    balances: dict[str, list[Balance]] = {}
-    for part in parts:
-        for name, equation in jit(balance)(experiment, part).items():
-            balances.setdefault(name, []).append(Balance(*(decimate(torque, factor) for torque in equation)))
-    return {name: Balance(*map(jnp.concatenate, zip(*pieces, strict=True))) for name, pieces in balances.items()}
+    balances = [jit(balance)(experiment, part) for part in parts]
+    pieces = jax.tree.map(lambda torque: decimate(torque, factor), balances)
+    return jax.tree.map(lambda *torques: jnp.concatenate(torques), *pieces) if pieces else {}
 
 
 def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
@@ -283,15 +279,11 @@ def find_motion_share(experiment: Experiment, parts: Sequence[Kinematics], facto
         if side not in experiment.sides or len(torque) < 2 * _BLOCKS * _BINS:
             continue
         for name in ("velocity", "position"):
-            values = [decimate(jnp.asarray(getattr(part, name)[side]), factor) for part in parts]
-            gains = _gains_by_ranges(torque - np.mean(torque), np.concatenate(values))
-            if np.mean(gains) > _SURE * np.std(gains, ddof=1) / np.sqrt(_BLOCKS):
+            values = np.concatenate([decimate(jnp.asarray(getattr(part, name)[side]), factor) for part in parts])
+            ranges = np.eye(_BINS)[np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)]
+            regression = BlockRegression.of(torque - np.mean(torque), ranges, _BLOCKS)
+            # power that its means over ranges predict, in each block from the others
+            gains = regression.held_out(np.zeros((_BLOCKS, _BINS))) - regression.held_out()
+            if np.mean(gains) > _SURE * mean_error(gains):
                 shares.append(MotionShare(side, name, float(np.mean(gains) / np.var(torque))))
     return max(shares, key=lambda share: share.share, default=None)
-
-
-def _gains_by_ranges(torque: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " blocks"]:
-    """Power of a torque that its means over ranges of a channel predict, in each block of the log from the other blocks."""
-    ranges = np.eye(_BINS)[np.searchsorted(np.quantile(values, np.arange(1, _BINS) / _BINS), values)]
-    left = BlockRegression.of(torque, ranges, _BLOCKS).held_out()
-    return np.array([np.mean(part**2) for part in np.array_split(torque, _BLOCKS)]) - left

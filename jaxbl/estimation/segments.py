@@ -61,16 +61,12 @@ class Segment:
 
     def __getitem__(self, part: slice) -> "Segment":
         """Some of its samples, in a row."""
+        columns = self.time, self.torque, self.readings, self.smoothed, self.transmitted
+        time, *columns = jax.tree.map(lambda values: values[part] if np.ndim(values) else values, columns)
         first = part.start or 0
-        smoothed = {
-            side: motion._replace(state=motion.state[part], covariance=motion.covariance[part])
-            for side, motion in self.smoothed.items()
-        }
-        readings = {side: values[part] for side, values in self.readings.items()}
-        transmitted = None if self.transmitted is None else self.transmitted[part]
-        time, begin = self.time[part], self.rows.start + first
-        rows, before = slice(begin, begin + len(time)), self.torque[:first][-DELAY_SAMPLES:] if first else self.before
-        return Segment(rows, time, self.period, self.torque[part], readings, smoothed, transmitted, before)
+        rows = slice(self.rows.start + first, self.rows.start + first + len(time))
+        before = self.torque[:first][-DELAY_SAMPLES:] if first else self.before
+        return Segment(rows, time, self.period, *columns, before=before)
 
     @cached_property
     def torques(self) -> dict[Any, Any]:
@@ -132,12 +128,12 @@ def reading_noise(segments: Sequence[Segment]) -> dict[str, float]:
 
 def signal_sizes(experiment: Experiment, segments: Sequence[Segment]) -> SignalSizes:
     """Standard deviation of the input, rms speed of the motor, and standard deviation of the twist."""
-    motion = [segment.kinematics for segment in segments]
+    motion, twist = [segment.kinematics for segment in segments], 0.0
     speed = rms(np.concatenate([part.velocity["motor"] for part in motion]))
-    twist = [part.position["motor"] - experiment.drive.ratio("load") * part.position.get("load", 0.0) for part in motion]
-    geared = "load" in motion[0].position
     torque = float(np.std(np.concatenate([segment.torque for segment in segments])))
-    return SignalSizes(torque, speed, float(np.std(np.concatenate(twist))) if geared else 0.0)
+    if "load" in segments[0].readings:
+        twist = float(np.std(np.concatenate([experiment.plant.twist(part.position) for part in motion])))
+    return SignalSizes(torque, speed, twist)
 
 
 def long_enough(segments: Sequence[Segment], factor: int) -> list[Kinematics]:
@@ -157,20 +153,15 @@ def _hold_frictions(experiment: Experiment, segment: Segment, states: EffectStat
     Their state follows from the way covered, and there that is less than readings show.
     """
     plant, k, new_states = experiment.plant, segment.kinematics, list(states)
-    holding = [i for i, effect in enumerate(plant.effects) if type(effect).holds is not AbstractEffect.holds]
-    if not holding:
-        return states
-    acting = _torques(experiment, k, states)
-    for i in holding:
-        side = plant.drive.resolve_place(plant.effects[i].place)
-        motion = Motion(
-            k.time, k.position[side], k.velocity[side], k.torque if side == "motor" else jnp.zeros_like(k.torque)
-        )
-        balance = (
-            acting[side][0] + plant.holding_torque(side, motion, states)[0] - plant.inertia(side) * k.acceleration[side]
-        )
+    holding = {i: effect for i, effect in enumerate(plant.effects) if type(effect).holds is not AbstractEffect.holds}
+    acting = _torques(experiment, k, states) if holding else {}
+    for i, effect in holding.items():
+        side = plant.drive.resolve_place(effect.place)
+        torque = k.torque if side == "motor" else jnp.zeros_like(k.torque)
+        held, _ = plant.holding_torque(side, Motion(k.time, k.position[side], k.velocity[side], torque), states)
+        balance = acting[side][0] + held - plant.inertia(side) * k.acceleration[side]
         still = segment.smoothed[side].find_standstill(segment.period)
-        new_states[i] = jax.tree.map(partial(jnp.where, still), plant.effects[i].bent(balance), states[i])
+        new_states[i] = jax.tree.map(partial(jnp.where, still), effect.bent(balance), states[i])
     return tuple(new_states)
 
 

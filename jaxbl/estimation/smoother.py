@@ -11,15 +11,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from jaxbl.fused import Arrays, Leaves
 from jaxbl.fused.signal_scan import scan_signal
 
-Signal = Float[np.ndarray, " samples"]
-"""A number a sample."""
-Signals = Float[np.ndarray, "samples columns"]
-"""Several numbers a sample."""
 _SMOOTHNESS = 1e-14, 1e4
 """Range of q h^5 / sigma^2 that is searched: time constants of the smoother from 200 periods to a fraction of one."""
 _GRID = 19
@@ -44,28 +39,28 @@ class Smoothed(NamedTuple):
         jerk: spectral density q of the jerk, rad^2/s^5.
     """
 
-    state: Float[np.ndarray, "samples 3"]
-    covariance: Float[np.ndarray, "samples 3 3"]
+    state: np.ndarray
+    covariance: np.ndarray
     noise: float | np.floating
     jerk: float | np.floating
 
     @property
-    def position(self) -> Signal:
+    def position(self) -> np.ndarray:
         return self.state[:, 0]
 
     @property
-    def velocity(self) -> Signal:
+    def velocity(self) -> np.ndarray:
         return self.state[:, 1]
 
     @property
-    def acceleration(self) -> Signal:
+    def acceleration(self) -> np.ndarray:
         return self.state[:, 2]
 
-    def deviation(self, order: int) -> Signal:
+    def deviation(self, order: int) -> np.ndarray:
         """Standard deviation of the position (0), velocity (1) or acceleration (2)."""
         return self.covariance[:, order, order] ** 0.5
 
-    def find_standstill(self, period: float) -> Bool[np.ndarray, " samples"]:
+    def find_standstill(self, period: float) -> np.ndarray:
         """Find samples at which the position is not shown to move for a while: dry friction may hold it there.
 
         Neither velocity nor acceleration stands out of the velocity's noise, the latter over the smoother's time constant.
@@ -85,11 +80,15 @@ _FULL = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 """Where they stand in it."""
 
 
+def _unpack(columns: Leaves) -> tuple[Leaves, list[Leaves]]:
+    """A vector, and the symmetric matrix of which the numbers in its upper triangle follow."""
+    return columns[:3], [[columns[3 + i] for i in row] for row in _FULL]
+
+
 def _predict(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of the Kalman filter, in units of noise and period; kept: state and covariance of the prediction, its error
     and that one's variance."""
-    (smoothness,), x, (y,) = values, carry[:3], inputs
-    p = [[carry[3 + i] for i in row] for row in _FULL]
+    (smoothness,), (x, p), (y,) = values, _unpack(carry), inputs
     e, s = y - x[0], p[0][0] + 1.0
     gain = [p[i][0] / s for i in range(3)]
     # Joseph's form stays positive: (1 - K C) P (1 - K C)' + K K'
@@ -124,16 +123,14 @@ def _innovation(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, 
 
 def _correct(values: Leaves, carry: Leaves, inputs: Leaves) -> tuple[Leaves, Leaves]:
     """A sample of the backward pass, from what the filter kept there; kept: smoothed state and covariance."""
-    x, (e, s) = inputs[:3], inputs[9:]
-    p = [[inputs[3 + i] for i in row] for row in _FULL]
-    large = [[carry[3 + i] for i in row] for row in _FULL]
+    (x, p), (e, s), (small, large) = _unpack(inputs), inputs[9:], _unpack(carry)
     gain = [p[i][0] / s for i in range(3)]
 
     def dot(a: Leaves, b: Leaves) -> Any:
         return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
     # with C = 1 - K C: C' small, less the error; C' large C, and the precision of the reading
-    small = [carry[0] - dot(gain, carry[:3]) - e / s, carry[1], carry[2]]
+    small = [small[0] - dot(gain, small) - e / s, *small[1:]]
     w = [dot(row, gain) for row in large]
     first = [large[0][0] - 2.0 * w[0] + dot(gain, w) + 1.0 / s, large[0][1] - w[1], large[0][2] - w[2]]
     large = [first, [first[1], *large[1][1:]], [first[2], *large[2][1:]]]
@@ -165,14 +162,10 @@ def _first(position: Any, smoothness: Any) -> Leaves:
     """
     start = _start(position)
     *last, e, s = (column[-1] for column in _along(_predict, [smoothness + 0.0 * start[0]], start, [position[::-1]]))
-    x, p = last[:3], last[3:]
-    gain = [p[i] / s for i in _FULL[0]]
-    turned = 1.0, -1.0, 1.0
-    covariance = [p[_FULL[i][j]] - gain[i] * gain[j] * s for i, j in _UPPER]
-    return [
-        *(sign * (value + factor * e) for sign, value, factor in zip(turned, x, gain, strict=True)),
-        *(_SPREAD**2 * turned[i] * turned[j] * value for (i, j), value in zip(_UPPER, covariance, strict=True)),
-    ]
+    x, p = _unpack(last)
+    gain, turned = [number / s for number in p[0]], (1.0, -1.0, 1.0)
+    covariance = [_SPREAD**2 * turned[i] * turned[j] * (p[i][j] - gain[i] * gain[j] * s) for i, j in _UPPER]
+    return [*(turned[i] * (x[i] + gain[i] * e) for i in range(3)), *covariance]
 
 
 def _unit(position: Any) -> Any:
@@ -205,13 +198,13 @@ def _fit(position: np.ndarray) -> tuple[Any, Any]:
         # the first samples find the state
         e, s = (column[3:] for column in _along(_innovation, [np.exp(points)], start, [scaled]))
         variance = np.sum(e**2 / s, axis=0) / len(e)
-        best = np.argmax(-0.5 * (len(e) * np.log(variance) + np.sum(np.log(s), axis=0)))
+        best = np.argmin(len(e) * np.log(variance) + np.sum(np.log(s), axis=0))
         step = (high - low) / (_GRID - 1)
         low, high = points[best] - step, points[best] + step
     return np.exp(0.5 * (low + high)), np.sqrt(variance[best]) * unit
 
 
-def smooth(position: Signal, period: float, *, noise_and_jerk: tuple[Any, Any] | None = None) -> Smoothed:
+def smooth(position: np.ndarray, period: float, *, noise_and_jerk: tuple[Any, Any] | None = None) -> Smoothed:
     """Smooth one evenly sampled position channel.
 
     Args:
@@ -237,13 +230,11 @@ def smooth(position: Signal, period: float, *, noise_and_jerk: tuple[Any, Any] |
         return Smoothed(state, covariance, sigma, smoothness * sigma**2 / h**5)
 
 
-def smoothed_accelerations(positions: Signals, period: float, noise_and_jerk: tuple[Any, Any]) -> Signals:
-    """Accelerations of several channels, each smoothed as :func:`smooth` does with the same noise and jerk."""
+def smoothed_accelerations(positions: np.ndarray, period: float, noise_and_jerk: tuple[Any, Any]) -> np.ndarray:
+    """Accelerations of several channels, shape (samples, channels), each smoothed as :func:`smooth` does with the same noise
+    and jerk."""
     sigma, jerk = noise_and_jerk
-    smoothness, accelerations = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)
+    smoothness, firsts = np.float64(jerk * period**5 / sigma**2), range(0, positions.shape[1], _TOGETHER)
     with np.errstate(all="ignore"):
-        for first in range(0, positions.shape[1], _TOGETHER):
-            channels = positions[:, first : first + _TOGETHER]
-            acceleration = _passes((channels - channels[0]) / sigma, smoothness)[2]
-            accelerations[:, first : first + _TOGETHER] = acceleration * sigma / period**2
-    return accelerations
+        scaled = (positions - positions[0]) / sigma
+        return np.hstack([_passes(scaled[:, i : i + _TOGETHER], smoothness)[2] for i in firsts]) * sigma / period**2
