@@ -20,7 +20,7 @@ from .intervals import NORMAL, Profile, Refusal, interval
 from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, errors
 from .search import SearchFit, is_noise
-from .segments import at_period, long_enough, reading_noise, segments_of, windows_of
+from .segments import at_period, long_enough, segments_of, windows_of
 from .trajectory import eliminate_starts
 
 
@@ -40,18 +40,18 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     rebased = [at_period(model, record.sample_period) for model in (nominal, fitted)]
     at_rest = config.log.initial_state == "rest"
     segments = segments_of(record, nominal.sides, at_rest)
-    noise = reading_noise(segments)
     windows, _ = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
     left = [eliminate_starts(model, windows).residual for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
-        before, after = (noise[side] * rms(residual[:, :, i]) for residual in left)
-        position[side] = describe_position(record, side, noise[side], rms=after, nominal_rms=before)
+        noise = windows.noise[side]
+        before, after = (noise * rms(residual[:, :, i]) for residual in left)
+        position[side] = describe_position(record, side, noise, rms=after, nominal_rms=before)
     factor = decimation(config, record)
     parts = long_enough(segments, factor)
     before, torque = (torque_errors(record, model, parts, factor) for model in rebased)
     for name, figures in torque.items():
-        figures["nominal_rms"], figures["nominal_relative"] = before[name]["rms"], before[name]["relative"]
+        figures |= {f"nominal_{key}": before[name][key] for key in ("rms", "relative")}
     return {
         "file": str(record.path.resolve()),
         "window": windows.torque.shape[1] * record.sample_period,
@@ -65,11 +65,11 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
     if experiment.transmission is None:
         return {}
 
+    own = leaf_paths(experiment)
+
     def compute_others(theta: jax.Array) -> JsonObject:
-        model = set_free_parameters(experiment, search_fit.free, theta)
-        assert model.transmission is not None
-        names = {path.rpartition(".")[2] for path in leaf_paths(model) if path.startswith("transmission.")}
-        return {name: value for name, value in model.transmission.truth().items() if name not in names}
+        law: Any = set_free_parameters(experiment, search_fit.free, theta).transmission
+        return {name: value for name, value in law.truth().items() if f"transmission.{name}" not in own}
 
     values, slopes = (of(jnp.asarray(search_fit.fit.theta)) for of in (compute_others, jax.jacfwd(compute_others)))
     derived = {}
@@ -80,22 +80,20 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
     return derived
 
 
-def _parameters(record: Record, search_fit: SearchFit) -> dict[str, Quantity]:
-    """Values with standard errors and 95 % intervals, by path."""
-    deviation = np.sqrt(np.diag(search_fit.spread.covariance))
-    return {
-        parameter.path: Quantity(
-            float(parameter.value(coordinate)),
-            float(parameter.slope(coordinate)) * error,
-            interval(parameter, coordinate, error),
-            record.unit_of(parameter.path, parameter.unit),
-            parameter.nominal,
-        )
-        for parameter, coordinate, error in zip(search_fit.free, search_fit.fit.theta, deviation, strict=True)
-    }
+def _parameters(record: Record, search_fit: SearchFit, profiles: Mapping[str, Profile]) -> JsonObject:
+    """Values with standard errors and 95 % intervals, and their profiles if they were asked for, by path."""
+    entries, fitted = {}, zip(search_fit.free, search_fit.fit.theta, search_fit.spread.deviations, strict=True)
+    for parameter, theta, error in fitted:
+        value, deviation = float(parameter.value(theta)), float(parameter.slope(theta)) * error
+        unit, reach = record.unit_of(parameter.path, parameter.unit), interval(parameter, theta, error)
+        entries[parameter.path] = Quantity(value, deviation, reach, unit, parameter.nominal).to_dict()
+    for path, profile in profiles.items():
+        entries[path]["profile_interval"] = profile.interval
+        entries[path]["profile"] = np.column_stack([profile.values, profile.deviance])
+    return entries
 
 
-def by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
+def _by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
     """Describe how the trajectory fit went."""
 
     def by_path(values: Any) -> JsonObject:
@@ -115,21 +113,19 @@ def by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
     }
 
 
-def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profiles: Mapping[str, Profile]) -> JsonObject:
-    """The summary but for `method`, `torque`, `gains` and `holdout`; profiles by path, if they were asked for."""
-    record, noise, width = task.record, search_fit.windows.noise, search_fit.spread.covariance
-    deviation = np.sqrt(np.diag(width))
+def summary_of(
+    task: LogTask,
+    fitted: Experiment,
+    search_fit: SearchFit,
+    profiles: Mapping[str, Profile] = {},
+    recursive: Mapping[str, Any] = {},
+) -> JsonObject:
+    """The summary but for `torque`, `gains` and `holdout`; profiles by path, if they were asked for, and what the recursive
+    identifier ends with."""
+    record, noise, spread = task.record, search_fit.windows.noise, search_fit.spread
     # numbers that are not known have no correlation
     with np.errstate(invalid="ignore"):
-        correlation = width / np.outer(deviation, deviation)
-    numbers = _parameters(record, search_fit)
-    parameters = {path: number.to_dict() for path, number in numbers.items()}
-    for path, profile in profiles.items():
-        parameters[path] |= {
-            "profile_interval": profile.interval,
-            "profile": np.column_stack([profile.values, profile.deviance]),
-        }
-    parameters |= _derive_numbers(fitted, search_fit)
+        correlation = spread.covariance / np.outer(spread.deviations, spread.deviations)
     finer = (
         f"The fit has {search_fit.steps} plant steps a sample: with {fitted.run.substeps}, as in the study ([run]), numbers "
         "would be off by more than a tenth of their standard errors."
@@ -140,7 +136,7 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
     }
     return {
         **task.heading,
-        "parameters": parameters,
+        "parameters": _parameters(record, search_fit, profiles) | _derive_numbers(fitted, search_fit),
         "correlation": {"parameters": [parameter.path for parameter in search_fit.free], "matrix": correlation},
         "refused": [
             {"direction": refusal.direction, "why": _explain_refusal(refusal), "relative_deviation": refusal.deviation}
@@ -150,6 +146,7 @@ def summary_of(task: LogTask, fitted: Experiment, search_fit: SearchFit, profile
         "condition": search_fit.condition,
         "residual": residual,
         "steps": search_fit.steps,
+        "method": {"recursive": recursive, "trajectory": _by_trajectories(search_fit, record)},
         "rejected": None if all(map(is_noise, residual.values())) else {"lacks": None},
         "notes": [*record.notes, *([finer] if search_fit.steps != fitted.run.substeps else [])],
     }

@@ -23,7 +23,7 @@ from jaxbl.workers import Progress, limit_blas_threads, make_stage_counter
 
 from .feedback_bias import find_feedback_bias
 from .free_parameters import FreeParameter, free_values, make_free_parameters
-from .identification_summary import by_trajectories, mark_lacking, on_holdout, summary_of, torque_errors
+from .identification_summary import mark_lacking, on_holdout, summary_of, torque_errors
 from .intervals import profile
 from .log_columns import columns_of, note_damping, observer_chain
 from .logs import Logs, LogTask, SealedRecord, arrays, decimation, default_paths, on_record, read_with_holdout
@@ -154,9 +154,8 @@ def run_identification(task: LogTask, progress: Progress | None = None) -> Ident
         trace = pd.DataFrame(columns_of(record, segments, fitted, search_fit) | chain)
         factor = decimation(config, record)
         parts = long_enough(segments, factor)
-        method: JsonObject = {"recursive": recursive, "trajectory": by_trajectories(search_fit, record)}
         done()
-        summary = summary_of(task, fitted, search_fit, profiles) | {"method": method}
+        summary = summary_of(task, fitted, search_fit, profiles, recursive)
         summary["torque"] = torque_errors(record, fitted, parts, factor)
         summary["feedback"] = bias = find_feedback_bias(record, segments, fitted)
         summary["notes"] = [*(there["sentence"] for there in bias.values()), *summary["notes"], *damping]
@@ -176,12 +175,10 @@ def _from_motor(
 ) -> Identification:
     """The rest of an identification without the load's encoder; what needs both encoders is left out."""
     config, record = task.config, task.record
-    alone = search_alone(nominal, free, segments, config.identify, record, config.log.initial_state == "rest")
+    alone = search_alone(task, nominal, free, segments)
     done()
     trace = pd.DataFrame(columns_alone(record, alone))
-    summary = summary_of(task, alone.experiment, alone.search_fit, {})
-    summary["method"] = {"recursive": {}, "trajectory": by_trajectories(alone.search_fit, record)}
-    gap = gap_summary(alone)
+    summary, gap = summary_of(task, alone.experiment, alone.search_fit), gap_summary(alone)
     summary["torque"], summary["backlash"] = {}, gap
     if gap is not None and gap["why"]:
         for refusal in summary["refused"]:

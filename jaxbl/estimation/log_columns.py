@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import Experiment, NamedArrays, Signals, State, TracedArrays, replay
@@ -26,12 +24,13 @@ def join_columns(count: int, segments: Sequence[Segment], pieces: Sequence[Mappi
     return columns
 
 
-def motion_columns(segment: Segment, side: str) -> NamedArrays:
-    """Columns of a side's smoothed motion along a segment, with deviations."""
-    smoothed, columns = segment.smoothed[side], {}
-    for order, name in ((1, "velocity"), (2, "acceleration")):
-        columns[f"{side}.{name}"] = smoothed.state[:, order]
-        columns[f"{side}.{name}_deviation"] = smoothed.deviation(order)
+def motion_columns(segment: Segment) -> NamedArrays:
+    """Columns of each side's smoothed motion along a segment, with deviations."""
+    columns: NamedArrays = {}
+    for side, smoothed in segment.smoothed.items():
+        for order, name in ((1, "velocity"), (2, "acceleration")):
+            columns[f"{side}.{name}"] = smoothed.state[:, order]
+            columns[f"{side}.{name}_deviation"] = smoothed.deviation(order)
     return columns
 
 
@@ -46,15 +45,12 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     columns |= {POSITION_CHANNELS[side]: record.positions[side] for side in fitted.sides}
     if record.transmitted is not None:
         columns["transmitted"] = record.transmitted
-    pieces: list[NamedArrays] = []
+    pieces = []
     for segment in segments:
-        piece: NamedArrays = {}
-        for side in fitted.sides:
-            piece |= motion_columns(segment, side)
         deviation = {side: smoothed.deviation(1) for side, smoothed in segment.smoothed.items()}
-        for name, torque in model_torques(fitted, segment.kinematics, deviation).items():
-            piece["torque" if name == "transmission" else f"{name}.effects"] = np.asarray(torque)
-        pieces.append(piece)
+        torques = model_torques(fitted, segment.kinematics, deviation)
+        named = {"torque" if name == "transmission" else f"{name}.effects": torque for name, torque in torques.items()}
+        pieces.append(motion_columns(segment) | named)
     rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)).ravel()
     for i, side in enumerate(fitted.sides):
         column = columns[f"{side}.residual"] = np.full(len(record.time), np.nan)
@@ -62,15 +58,16 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     return columns | join_columns(len(record.time), segments, pieces)
 
 
+_ESTIMATES = "velocity_estimate", "torque_estimate"
+"""Columns of each observer."""
+
+
 @jit
-def _replay_observers(experiment: Experiment, torque: jax.Array, measured: TracedArrays) -> TracedArrays:
+def _replay_observers(experiment: Experiment, torque: Any, measured: Any) -> TracedArrays:
     def keep(state: State, signals: Signals) -> JsonObject:
-        row: JsonObject = {}
-        if signals.twist is not None:
-            row["twist"] = signals.twist
+        row: JsonObject = {} if signals.twist is None else {"twist": signals.twist}
         for side in experiment.sides:
-            row[f"{side}.velocity_estimate"] = signals.side(side).velocity_estimate
-            row[f"{side}.torque_estimate"] = signals.side(side).torque_estimate
+            row |= {f"{side}.{name}": getattr(signals.side(side), name) for name in _ESTIMATES}
         if state.identifier is not None:
             assert experiment.identifier is not None and experiment.transmission is not None
             path = experiment.identifier.estimate(state.identifier, experiment.transmission)
@@ -105,10 +102,9 @@ def observer_chain(experiment: Experiment, segments: Sequence[Segment], samples:
     Columns of shape (samples,), NaN elsewhere, and the identifier's numbers at the end, by name and side.
     """
     longest = max(segments, key=len)
-    readings = {side: jnp.asarray(longest.readings[side]) for side in experiment.sides}
-    signals = _replay_observers(experiment, jnp.asarray(longest.torque), readings)
+    signals = _replay_observers(experiment, longest.torque, longest.readings)
     # compiled programs sort their results by name
-    estimates = [f"{side}.{name}" for side in experiment.sides for name in ("velocity_estimate", "torque_estimate")]
+    estimates = [f"{side}.{name}" for side in experiment.sides for name in _ESTIMATES]
     in_order = {name: signals[name] for name in ("twist", *estimates, *signals) if name in signals}
     law_numbers = {} if experiment.transmission is None else experiment.transmission.truth()
     at_end = {name: {side: float(signals[f"{side}.{name}"][-1]) for side in experiment.sides} for name in law_numbers}

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import Experiment, PlantState
-from jaxbl.config.logs import IdentifyTable
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
@@ -23,12 +22,12 @@ from .free_parameters import FreeParameter
 from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
 from .log_columns import join_columns, motion_columns
-from .logs import arrays
-from .regression import balance
+from .logs import LogTask, arrays
+from .regression import balance, transmit
 from .search import SearchFit
 from .segments import Segment, at_period, segments_of
 from .trajectory import Fit, cut
-from .unseen_load import SHOWN, Gap, GapSearch, Point, UnseenLoad, half_gap_of, is_known, widths
+from .unseen_load import SHOWN, Gap, Point, UnseenLoad, find_gap, half_gap_of, is_known, widths
 
 
 class Alone(NamedTuple):
@@ -61,26 +60,20 @@ class Alone(NamedTuple):
         return bool(self.reason) and self.gap is not None and (self.gap.is_needed or self.gap.unmet)
 
 
-def search_alone(
-    nominal: Experiment,
-    free: tuple[FreeParameter, ...],
-    segments: Sequence[Segment],
-    settings: IdentifyTable,
-    record: Record,
-    at_rest: bool,
-) -> Alone:
-    """Fit a model to the motor's readings in a record; other arguments as of :class:`.search.ParameterSearch`.
+def search_alone(task: LogTask, nominal: Experiment, free: tuple[FreeParameter, ...], segments: Sequence[Segment]) -> Alone:
+    """Fit a model to the motor's readings; other arguments as of :class:`.search.ParameterSearch`.
 
     Raises:
         InputError: the model diverges.
     """
-    model = UnseenLoad(nominal, free, widths(free, settings.spread), segments, at_rest)
+    record, spread = task.record, task.config.identify.spread
+    model = UnseenLoad(nominal, free, widths(free, spread), segments, task.config.log.initial_state == "rest")
     gap, point = search_gap(model, record)
     if gap is not None and gap.is_needed:
         width = gap.spread
     else:
         point, width = dataclasses.replace(model, held=[] if model.gap is None else [model.gap]).settle(point)
-    alone = alone_of(model, point, width, [], gap, settings.spread, record)
+    alone = alone_of(model, point, width, [], gap, spread, record)
     if not_met(model, alone.point, record) or alone.doubtful:
         # numbers of a model that the log contradicts, with a gap of any size, or without a load have no interval
         nothing = np.full_like(alone.search_fit.spread.covariance, np.inf)
@@ -95,7 +88,7 @@ def search_gap(model: UnseenLoad, record: Record) -> tuple[Gap | None, Point]:
     Raises:
         InputError: the model diverges.
     """
-    gap = None if model.gap is None else GapSearch(model).run()
+    gap = None if model.gap is None else find_gap(model)
     point = model.fit() if gap is None else gap.best if gap.is_needed else gap.without
     if not np.isfinite(point.deviance):
         raise InputError(f"{record.path}: the model diverges on this log; its nominal numbers should be nearer")
@@ -168,7 +161,7 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
     if far:
         numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
         return f"the log is met only with numbers far from the nominal ones ({numbers}); check these, or the log"
-    if not gap.spread.covariance[model.gap, model.gap] ** 0.5 < UNSEEN:
+    if not gap.spread.deviations[model.gap] < UNSEEN:
         return f"one would be met, but of any size up to {gap.travel:.3g} {unit}; {both_ways}"
     return ""
 
@@ -178,7 +171,7 @@ def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collec
     sought = np.setdiff1d(np.arange(len(model.free)), [*absent])
     width_sought = width.only(sought)
     refused, condition = refusals([model.free[i] for i in sought], width_sought)
-    visible = sought[np.sqrt(np.diag(width_sought.covariance)) < UNSEEN]
+    visible = sought[width_sought.deviations < UNSEEN]
     torque = np.concatenate([segment.torque for segment in model.segments])
     # all of the log as one window, without a state of its own
     windows = cut(torque, {}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque))
@@ -190,7 +183,7 @@ def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collec
         spread=width.only(visible)._replace(variance=point.variance / model.noise**2),
         windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
         refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
-        held=[], condition=condition, starts=[], steps=model.experiment.run.substeps,
+        condition=condition, steps=model.experiment.run.substeps,
     )  # fmt: skip
 
 
@@ -203,7 +196,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     fitted, model, pieces = alone.experiment, alone.model, []
     for segment, state in zip(model.segments, model.states(alone.point), strict=True):
         k, state = segment.kinematics, jax.tree.map(jnp.asarray, state)
-        through = jax.vmap(fitted.plant.transmitted_torque)(state.position, state.velocity, state.effects)[0]
+        through = transmit(fitted.plant, state, state.effects)
         # without a torque in the gear the motor's equation leaves over what it should be
         none = jnp.zeros_like(through)
         motion = dataclasses.replace(
@@ -211,7 +204,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
             acceleration={"load": none} | k.acceleration, transmitted=none,
         )  # fmt: skip
         pieces.append(
-            motion_columns(segment, "motor")
+            motion_columns(segment)
             | {
                 "motor.residual": segment.readings["motor"] - state.position["motor"],
                 "load.modelled_position": state.position["load"],

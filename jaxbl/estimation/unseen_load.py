@@ -46,7 +46,7 @@ _FOLLOWING = 1e-2, 1e-4
 """Smoothness q h^3 / sigma^2 of the predictors that a fit begins with: they remember some 3 and 10 samples."""
 _SMOOTHNESS = 10.0 ** np.arange(-13.0, 0.1)
 """Values tried for the last predictor, from a free run to one that follows every reading."""
-_SHARES = 0.2, 0.5, 0.85
+_SHARES = np.array([0.2, 0.5, 0.85])
 """Of the load in the frictions that a fit begins with."""
 _STARTS = 12
 """Half gaps that a fit begins at."""
@@ -133,7 +133,7 @@ class UnseenLoad:
 
     def __post_init__(self):
         # half gaps are sought over decades
-        self.free = tuple(parameter._replace(positive=True) if is_gap(parameter) else parameter for parameter in self.free)
+        self.free = tuple(number._replace(positive=number.positive or is_gap(number)) for number in self.free)
         self.period = float(self.experiment.run.sample_period)
         self.skipped = [int(_SKIPPED * len(segment)) for segment in self.segments]
         # segment of each error
@@ -154,18 +154,24 @@ class UnseenLoad:
         """Place of the number that makes the gap, if it is one of the free ones."""
         return next((i for i, number in enumerate(self.free) if is_gap(number)), None)
 
+    @property
+    def travel(self) -> float:
+        """Of the motor, rad."""
+        return float(max(np.ptp(segment.readings["motor"]) for segment in self.segments))
+
     def beginnings(self) -> list[np.ndarray]:
         """Theta to begin at, shape (free,): frictions that together are what the log shows of a drive without gap, mostly
         the motor's and mostly the load's.
 
         From a friction that is too large no way leads back: the load sticks, and nothing depends on it.
         """
-        motions = [segment.kinematics for segment in self.segments]
-        columns = [(k.acceleration["motor"], k.velocity["motor"], k.torque) for k in motions]
-        acceleration, speed, torque = map(np.concatenate, zip(*columns, strict=True))
-        matrix = np.stack([acceleration, speed, np.sign(speed), np.ones(len(speed))], axis=1)
-        moving = np.abs(speed) > 0.1 * self._speed
-        coefficients = np.linalg.lstsq(matrix[moving], torque[moving], rcond=None)[0]
+        rows = []
+        for k in (segment.kinematics for segment in self.segments):
+            speed = k.velocity["motor"]
+            rows.append(np.stack([k.acceleration["motor"], speed, np.sign(speed), np.ones(len(speed)), k.torque], axis=1))
+        moving = np.concatenate(rows)
+        moving = moving[np.abs(moving[:, 1]) > 0.1 * self._speed]
+        coefficients = np.linalg.lstsq(moving[:, :-1], moving[:, -1], rcond=None)[0]
         least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
         total, thetas = np.maximum(coefficients[1:3], least), np.zeros((len(_SHARES), len(self.free)))
         viscous = {"drive.motor_viscous": "motor", "drive.load_viscous": "load"}
@@ -177,10 +183,10 @@ class UnseenLoad:
         # friction at the load counts by a power of the gear at the motor
         for size, power, side_of in zip(total, (2, 1), (viscous, dry), strict=True):
             places = [i for i, number in enumerate(self.free) if number.path in side_of]
-            for i, parts in zip(places, (1.0 - np.array(_SHARES), _SHARES), strict=False):
+            shares = [1.0 - _SHARES, _SHARES] if len(places) > 1 else [np.ones_like(_SHARES)]
+            for i, share in zip(places, shares, strict=False):
                 factor = float(self.experiment.drive.ratio(side_of[self.free[i].path])) ** -power
-                for theta, part in zip(thetas, parts, strict=True):
-                    theta[i] = self.free[i].theta((part if len(places) > 1 else 1.0) * size / factor)
+                thetas[:, i] = [self.free[i].theta(part * size / factor) for part in share]
         return list(thetas)
 
     def coarse(self) -> "UnseenLoad":
@@ -197,10 +203,10 @@ class UnseenLoad:
         """The same with so many plant steps a sample."""
         return replace(self, experiment=replace(self.experiment, run=replace(self.experiment.run, substeps=steps)))
 
+    @np.errstate(over="ignore")
     def numbers(self, theta: np.ndarray) -> dict[str, float]:
         """Values by path."""
-        with np.errstate(over="ignore"):
-            return free_values(self.free, theta)
+        return free_values(self.free, theta)
 
     def number(self, path: str, theta: np.ndarray) -> float:
         """Value of a number of the model, free or not."""
@@ -209,9 +215,15 @@ class UnseenLoad:
     def half_gap(self, theta: np.ndarray) -> float:
         """Half gap, rad."""
         if self.gap is None:
-            return float(self.experiment.plant.half_gap)
+            return self.experiment.plant.half_gap
         number = self.free[self.gap]
         return half_gap_of(number) * self.numbers(theta)[number.path]
+
+    def with_gap(self, half: float, theta: np.ndarray) -> np.ndarray:
+        """Theta with a half gap, rad."""
+        place: Any = self.gap
+        number = self.free[place]
+        return np.where(np.arange(len(theta)) == place, number.theta(half / half_gap_of(number)), theta)
 
     def states(self, point: Point) -> list[PlantState]:
         """The predictor's states before it has seen each sample's reading, by segment, leaves of shape (samples,)."""
@@ -220,7 +232,7 @@ class UnseenLoad:
         largest = self.half_gap(point.theta) + self.torque / self.number("transmission.stiffness", point.theta)
         states_of = []
         for segment, effects, offset in zip(self.segments, self._first_states, point.start, strict=True):
-            motion, still = segment.smoothed["motor"], 0.0 if self.at_rest else 1.0
+            motion, still = segment.smoothed["motor"], float(not self.at_rest)
             position, velocity = (motion.state[0, i] + motion.deviation(i)[0] * offset[i] for i in (0, 1))
             load = velocity + _APART * self._speed * offset[3]
             state = PlantState(
@@ -228,9 +240,8 @@ class UnseenLoad:
                 {"motor": still * velocity, "load": still * load / ratio},
                 effects,
             )
-            arguments = state, segment.torque, segment.time[0], {"motor": segment.readings["motor"]}
-            start, torque, time, readings = jax.tree.map(lambda x: np.asarray(x)[None], arguments)
-            states = self._model(numbers, start, torque, time, readings, gain)
+            arguments = state, segment.torque, segment.time[0], segment.readings
+            states = self._model(numbers, *jax.tree.map(lambda x: np.asarray(x)[None], arguments), gain=gain)
             states_of.append(jax.tree.map(lambda x: x[0], states))
         return states_of
 
@@ -239,11 +250,19 @@ class UnseenLoad:
         pieces = zip(self.segments, self.states(point), self.skipped, strict=True)
         # a model that diverges
         with _ignore_divergence():
-            errors = np.concatenate(
-                [(segment.readings["motor"] - state.position["motor"])[skip:] for segment, state, skip in pieces]
-            )
-            deviance = float(self.count * np.log(np.mean(errors**2)) + np.sum(self.precision * point.away**2))
-        return point._replace(errors=errors, deviance=deviance if np.isfinite(deviance) else np.inf)
+            errors = [(segment.readings["motor"] - state.position["motor"])[skip:] for segment, state, skip in pieces]
+            point = point._replace(errors=np.concatenate(errors))
+            deviance = float(self.count * np.log(point.variance) + np.sum(self.precision * point.away**2))
+        return point._replace(deviance=deviance if np.isfinite(deviance) else np.inf)
+
+    def twists(self, point: Point) -> list[Any]:
+        """Twist by segment, rad, shape (samples,)."""
+        ratio = self.number("drive.gear_ratio", point.theta)
+        return [state.position["motor"] - ratio * state.position["load"] for state in self.states(point)]
+
+    def count_turns(self, point: Point, size: float) -> int:
+        """Count changes of sign of the twist between values of at least some size, rad: of flanks, if it is the half gap."""
+        return sum(int(np.count_nonzero(np.diff(np.sign(twist[np.abs(twist) >= size])))) for twist in self.twists(point))
 
     @cached_property
     def _first_states(self) -> list[EffectStates]:
@@ -254,10 +273,9 @@ class UnseenLoad:
 
     @cached_property
     def _model(self) -> PlantSimulator:
-        zero: Any = dict.fromkeys(("motor", "load"), 0.0)
-        return PlantSimulator(
-            self.experiment, PlantState(zero, zero, self._first_states[0]), [number.path for number in self.free], ["motor"]
-        )
+        zero: Any = {"motor": 0.0, "load": 0.0}
+        example = PlantState(zero, zero, self._first_states[0])
+        return PlantSimulator(self.experiment, example, [number.path for number in self.free], ["motor"])
 
     def begin(self, theta: np.ndarray, smoothness: float) -> Point:
         """With each segment beginning where in the gap, and with which speed of the load, suits it best."""
@@ -266,7 +284,7 @@ class UnseenLoad:
         squares = [
             np.bincount(self.owner, self.evaluate(none._replace(start=none.start + start)).errors ** 2) for start in tries
         ]
-        best = np.argmin(np.where(np.isfinite(squares), squares, np.inf), axis=0)
+        best = np.argmin(np.nan_to_num(squares, nan=np.inf), axis=0)
         return self.evaluate(none._replace(start=np.array(tries)[best]))
 
     def predict(self, theta: np.ndarray, smoothness: float) -> Point:
@@ -442,93 +460,64 @@ _NONE = 1e-9
 """Half gap over the motor's travel that stands for none."""
 
 
-class GapSearch:
-    """The search for a gap: fits from many half gaps, and without one.
+def find_gap(model: UnseenLoad) -> Gap:
+    """Search for a gap, which is among a model's free numbers: fits from many half gaps, and without one."""
+    place: Any = model.gap
+    coarse, held, travel = model.coarse(), replace(model, held=[place]), model.travel
+    stated = [i for i, number in enumerate(model.free) if is_known(number)]
+    part = replace(coarse, held=[*stated, place], segments=[max(model.segments, key=len)[:_PART]])
 
-    Args:
-        model: with the gap among its free numbers.
-    """
-
-    def __init__(self, model: UnseenLoad):
-        self.model, self.coarse = model, model.coarse()
-        assert model.gap is not None
-        self.place: int = model.gap
-        # the same with the gap as it is
-        self.model_held, self.coarse_held = (replace(fits, held=[self.place]) for fits in (model, self.coarse))
-        stated = [i for i, number in enumerate(model.free) if is_known(number)]
-        part = [max(model.segments, key=len)[:_PART]]
-        self.part = replace(self.coarse, held=[*stated, self.place], segments=part)
-        self.travel = float(max(np.ptp(segment.readings["motor"]) for segment in model.segments))
-
-    def _with_gap(self, half: float, theta: np.ndarray) -> np.ndarray:
-        """Theta with a half gap, rad."""
-        number = self.model.free[self.place]
-        return np.where(np.arange(len(theta)) == self.place, number.theta(half / half_gap_of(number)), theta)
-
-    def run(self) -> Gap:
-        """Search."""
-        announce("trying half gaps")
-        # from the encoder's noise to more than the motor's travel, where the load is never met
-        low = max(2.0 * self.model.noise, 1e-4 * self.travel)
-        grid = [*np.geomspace(low, 0.5 * self.travel, _STARTS - 1), 2.0 * self.travel]
-        starts = [self._begin(float(half)) for half in grid]
-        announce("fitting the gap")
-        likely = sorted(starts, key=lambda point: point.variance)[:_FINALISTS]
-        fits = [self.coarse.solve(self.coarse.begin(point.theta, _FOLLOWING[-1]), _MORE) for point in likely]
-        best, spread = self.model.settle(self.model.fit([_likeliest(fits).theta]))
-        announce("fitting without a gap")
-        none = _NONE * self.travel
-        without = self.model_held.fit([self._begin(none).theta, self._with_gap(none, best.theta)])
-        # what neighbouring fits find differently makes numbers uncertain, and rules out less; it is no correlation of errors
-        correlated, worth = (
-            max(float(width.inflation[self.place]) ** 2, 1.0) for width in (self.model.spread(best), spread)
-        )
-        gain = max(without.deviance - best.deviance, 0.0) / correlated
-        gap = Gap(best, without, spread, gain, 0, self.travel, self.travel)
-        if gap.is_needed:
-            return gap._replace(crossings=self._turns(best, self.model.half_gap(best.theta)))
-        if self._unmet(without, starts[-1], worth):
-            return gap._replace(unmet=True)
-        # of the torque in the gear, by a twentieth of the input's rms on either side
-        wound = 0.05 * self.model.torque / self.model.number("transmission.stiffness", without.theta)
-        return gap._replace(at_most=self._at_most(without, worth), crossings=self._turns(without, wound))
-
-    def _begin(self, half: float) -> Point:
+    def begin(half: float) -> Point:
         """A short fit of frictions at a half gap, inertias and stiffness as given."""
-        starts = [self.part.begin(self._with_gap(half, theta), _FOLLOWING[0]) for theta in self.model.beginnings()]
-        return min((self.part.solve(start, _FEW) for start in starts), key=lambda point: point.variance)
+        starts = [part.begin(model.with_gap(half, theta), _FOLLOWING[0]) for theta in model.beginnings()]
+        return min((part.solve(start, _FEW) for start in starts), key=lambda point: point.variance)
 
-    def _unmet(self, without: Point, begun: Point, worth: float) -> bool:
-        """Tell if the motor alone meets the readings as well as both without a gap; `begun` at more than its travel."""
-        # the load in the middle of the gap
-        middle = begun._replace(start=np.zeros_like(without.start))
-        point = self.model_held.finish(self.coarse_held.resume(middle, _MORE, _FOLLOWING[-1]))
-        # a fit may end with another predictor than the one without a gap did: the same one is tried, too
-        point = _likeliest([point, self.model_held.resume(point, _MORE, without.smoothness)])
-        # on one flank, where a weight may hold the load, the load is met
-        half = self.model.half_gap(point.theta)
-        met = any(np.any(np.abs(twist) >= half) for twist in self._twists(point))
-        return not met and (point.deviance - without.deviance) / worth < SHOWN
+    announce("trying half gaps")
+    # from the encoder's noise to more than the motor's travel, where the load is never met
+    low = max(2.0 * model.noise, 1e-4 * travel)
+    starts = [begin(float(half)) for half in (*np.geomspace(low, 0.5 * travel, _STARTS - 1), 2.0 * travel)]
+    announce("fitting the gap")
+    likely = sorted(starts, key=lambda point: point.variance)[:_FINALISTS]
+    fits = [coarse.solve(coarse.begin(point.theta, _FOLLOWING[-1]), _MORE) for point in likely]
+    best, spread = model.settle(model.fit([_likeliest(fits).theta]))
+    announce("fitting without a gap")
+    none = _NONE * travel
+    without = held.fit([begin(none).theta, model.with_gap(none, best.theta)])
+    # what neighbouring fits find differently makes numbers uncertain, and rules out less; it is no correlation of errors
+    correlated, worth = (max(float(width.inflation[place]) ** 2, 1.0) for width in (model.spread(best), spread))
+    gain = max(without.deviance - best.deviance, 0.0) / correlated
+    gap = Gap(best, without, spread, gain, 0, travel, travel)
+    if gap.is_needed:
+        return gap._replace(crossings=model.count_turns(best, model.half_gap(best.theta)))
+    if _is_unmet(held, without, starts[-1], worth):
+        return gap._replace(unmet=True)
+    # of the torque in the gear, by a twentieth of the input's rms on either side
+    wound = 0.05 * model.torque / model.number("transmission.stiffness", without.theta)
+    return gap._replace(at_most=_find_at_most(held, without, worth), crossings=model.count_turns(without, wound))
 
-    def _at_most(self, without: Point, worth: float) -> float:
-        """The largest half gap that fits about as well as none; the motor's travel where all do."""
-        half = max(0.5 * self.model.noise, 1e-5 * self.travel)
-        point, deviances = without, [(half, 0.0)]
-        while half < self.travel:
-            point = point._replace(theta=self._with_gap(half, point.theta))
-            point = self.model_held.resume(point, _FEW, without.smoothness)
-            deviances.append((half, (point.deviance - without.deviance) / worth))
-            if deviances[-1][1] > LIMIT:
-                return step_at_limit(deviances)
-            half *= 1.6
-        return self.travel
 
-    def _twists(self, point: Point) -> list[np.ndarray]:
-        """Twist by segment, rad."""
-        ratio = self.model.number("drive.gear_ratio", point.theta)
-        return [np.asarray(state.position["motor"] - ratio * state.position["load"]) for state in self.model.states(point)]
+def _is_unmet(held: UnseenLoad, without: Point, begun: Point, worth: float) -> bool:
+    """Tell if the motor alone meets the readings as both do without a gap, with a model in which the gap is held; `begun`
+    at more than its travel."""
+    # the load in the middle of the gap
+    middle = begun._replace(start=np.zeros_like(without.start))
+    point = held.finish(held.coarse().resume(middle, _MORE, _FOLLOWING[-1]))
+    # a fit may end with another predictor than the one without a gap did: the same one is tried, too
+    point = _likeliest([point, held.resume(point, _MORE, without.smoothness)])
+    # on one flank, where a weight may hold the load, the load is met
+    half = held.half_gap(point.theta)
+    met = any(np.any(np.abs(twist) >= half) for twist in held.twists(point))
+    return not met and (point.deviance - without.deviance) / worth < SHOWN
 
-    def _turns(self, point: Point, size: float) -> int:
-        """Count changes of sign of the twist between values of at least some size, rad: of flanks, if it is the half gap."""
-        twists = self._twists(point)
-        return sum(int(np.count_nonzero(np.diff(np.sign(twist[np.abs(twist) >= size])))) for twist in twists)
+
+def _find_at_most(held: UnseenLoad, without: Point, worth: float) -> float:
+    """Find the largest half gap that fits about as well as none; the motor's travel where all do."""
+    half = max(0.5 * held.noise, 1e-5 * held.travel)
+    point, deviances = without, [(half, 0.0)]
+    while half < held.travel:
+        point = held.resume(point._replace(theta=held.with_gap(half, point.theta)), _FEW, without.smoothness)
+        deviances.append((half, (point.deviance - without.deviance) / worth))
+        if deviances[-1][1] > LIMIT:
+            return step_at_limit(deviances)
+        half *= 1.6
+    return held.travel
