@@ -13,6 +13,7 @@ from jaxbl.drive.transmission import DeadZone, LinearShaft
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
+from jaxbl.quantity import Quantity
 from jaxbl.records import LogTable, Record, check_positions, read_log_table, read_record
 from jaxbl.records.element import Element, element_error, fit_element
 from jaxbl.records.inspection import make_rig_log
@@ -126,20 +127,20 @@ def run_element(task: ElementTask) -> ElementIdentification:
             "and fro"
         )
     stiffness = element.numbers["stiffness"]
-    if "stiffness" in element.open or stiffness.value <= 0.0:
-        determined = element.numbers.keys() - {"stiffness", "offset", "centre", *element.open}
-        remark = "".join(f"; what it shows: {name} {element.numbers[name]}" for name in sorted(determined))
+    shown = {name: number for name, number in element.numbers.items() if name not in element.open}
+    if "stiffness" not in shown or stiffness.value <= 0.0:
+        determined = sorted(shown.keys() - {"stiffness", "offset", "centre"})
+        remark = "".join(f"; what it shows: {name} {shown[name]}" for name in determined)
         raise InputError(
             f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){remark}; "
             "see columns and signs in [log]"
         )
     trace = pd.DataFrame({"t": record.time, "u": log.torque, "displacement": log.position, "torque": element.torque})
-    return ElementIdentification(task, element, to_jsonable(_summary(task, element)), trace, _tables(element))
+    return ElementIdentification(task, element, to_jsonable(_summary(task, element, shown)), trace, _tables(shown))
 
 
-def _summary(task: ElementTask, element: Element) -> JsonObject:
+def _summary(task: ElementTask, element: Element, shown: Mapping[str, Quantity]) -> JsonObject:
     record = task.record
-    numbers = {name: number for name, number in element.numbers.items() if name not in element.open}
     summary = {
         "title": f"Transmission of {record.path.name}",
         "kind": "element",
@@ -147,7 +148,7 @@ def _summary(task: ElementTask, element: Element) -> JsonObject:
         "file": str(record.path.resolve()),
         "samples": len(record.time),
         "sample_period": record.sample_period,
-        "parameters": {_PATHS.get(name, name): number.to_dict() | {"nominal": None} for name, number in numbers.items()},
+        "parameters": {_PATHS.get(name, name): number.to_dict() | {"nominal": None} for name, number in shown.items()},
         "refused": [
             {"direction": {_PATHS.get(name, name): 1.0}, "why": "this log leaves it open by more than half of its value"}
             for name in element.open
@@ -155,7 +156,7 @@ def _summary(task: ElementTask, element: Element) -> JsonObject:
         "method": {"element": {"terms": element.model.terms, "gains": element.gains, "reversals": element.reversals}},
         "torque": {"element": {"rms": element.residual, "relative": element.share, "unit": element.numbers["offset"].unit}},
         "warnings": record.warnings,
-        "notes": [*record.notes, *([_SLIP_NOTE] if "slip" in numbers else [])],
+        "notes": [*record.notes, *([_SLIP_NOTE] if "slip" in shown else [])],
     }
     if task.holdout is not None:
         error = element_error(element, make_rig_log(task.holdout.open(), task.gear_ratio))
@@ -164,15 +165,14 @@ def _summary(task: ElementTask, element: Element) -> JsonObject:
     return summary
 
 
-def _tables(element: Element) -> JsonObject:
-    value = {name: number.value for name, number in element.numbers.items() if name not in element.open}
-    law = DeadZone if "half_gap" in value else LinearShaft
-    tables: dict[str, JsonObject] = {"transmission": {"law": law.name}}
+def _tables(shown: Mapping[str, Quantity]) -> JsonObject:
+    transmission: JsonObject = {"law": (DeadZone if "half_gap" in shown else LinearShaft).name}
+    effects: dict[str, JsonObject] = {}
     for name, path in _PATHS.items():
-        if name in value:
+        if name in shown:
             owner, _, key = path.removeprefix("effects.").rpartition(".")
-            tables.setdefault(owner, {"kind": owner})[key] = value[name]
-    transmission = tables.pop("transmission")
+            table = transmission if owner == "transmission" else effects.setdefault(owner, {"kind": owner})
+            table[key] = shown[name].value
     # a hysteresis whose length is open has no torque that a study could simulate
-    complete = [effect for kind, effect in tables.items() if not kind.endswith(Hysteresis.kind) or len(effect) == 3]
+    complete = [effect for kind, effect in effects.items() if not kind.endswith(Hysteresis.kind) or len(effect) == 3]
     return {"transmission": transmission} | ({"effects": complete} if complete else {})

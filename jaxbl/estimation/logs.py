@@ -5,6 +5,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -55,7 +56,7 @@ class SealedRecord:
 def _hash_of(record: Record) -> bytes:
     total = hashlib.sha256(str(record.segments).encode())
     for values in (record.time, record.torque, *record.positions.values(), record.transmitted, record.reference):
-        total.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+        total.update(b"" if values is None else values.tobytes())
     return total.digest()
 
 
@@ -84,17 +85,15 @@ class LogTask:
     @property
     def heading(self) -> dict[str, Any]:
         """Facts on the logs that every summary has, as in `identification.json` and `diagnosis.json`."""
-        other = None if self.holdout is None or self.holdout.path == self.record.path else self.holdout
+        other = self.holdout
+        separate = () if other is None or other.path == self.record.path else other.warnings
         return {
             "title": self.config.title,
             "identity": self.identity,
             "file": str(self.record.path.resolve()),
             "samples": len(self.record.time),
             "sample_period": self.record.sample_period,
-            "warnings": [
-                *self.record.warnings,
-                *(f"Held-out log: {warning}" for warning in (other.warnings if other else ())),
-            ],
+            "warnings": [*self.record.warnings, *(f"Held-out log: {warning}" for warning in separate)],
         }
 
     @property
@@ -153,16 +152,21 @@ def read_logs(
     return join_records([first, *following] if like is None else following)
 
 
+def _is_longer(period: float, other: float) -> bool:
+    """Return True if a sampling period (s) is longer than another one, by enough to change results."""
+    return period > other and not math.isclose(period, other, rel_tol=_NEAR)
+
+
 def _alike(period: float, other: float) -> bool:
     """Return True if two sampling periods (s) are the same but for rounding."""
-    return bool(np.isclose(period, other, rtol=1e-6, atol=0.0))
+    return math.isclose(period, other, rel_tol=1e-6)
 
 
 def _at_one_period(config: Config, records: Sequence[Record], like: Record | None) -> Config:
     """The study with `[log] resample` where logs are not sampled alike."""
     periods = [record.sample_period for record in records]
     longest = max(periods)
-    if like is not None and longest < like.sample_period and not np.isclose(longest, like.sample_period, rtol=_NEAR):
+    if like is not None and _is_longer(like.sample_period, longest):
         longest = like.sample_period
     if all(_alike(period, longest) for period in periods):
         return config
@@ -180,10 +184,9 @@ def read_with_holdout(
     if holdout is None:
         return record, None
     other = _read_held_out(config, holdout, record, seeks_delay)
-    if other.sample_period > record.sample_period and not np.isclose(other.sample_period, record.sample_period, rtol=_NEAR):
+    if _is_longer(other.sample_period, record.sample_period):
         config = config.with_keys("log", resample=other.sample_period)
-        record = read_logs(config, logs, seeks_delay=seeks_delay)
-        other = _read_held_out(config, holdout, record, seeks_delay)
+        return read_with_holdout(config, logs, holdout, seeks_delay=seeks_delay, share=share)
     check_positions(record, other)
     return record, other
 
@@ -208,15 +211,14 @@ def _from_zero_of(first: Record, record: Record, config: Config, share: float) -
     table, geared = config.log, config.drive.kind == "two_inertia"
     two = geared and all("load" in log.positions for log in (first, record))
     has_offset = any(channel is not None and channel.offset is not None for channel in (table.theta_e, table.theta_s))
-    if has_offset or "motor" not in record.positions or record.statistics.channels["theta_e"].unit != "rad":
+    if has_offset or record.statistics.channels["theta_e"].unit != "rad":
         return record
     ratio = config.drive.gear_ratio if geared else 1.0
     motions = []
     for log in (first, record):
         assert log.torque is not None
         load = ratio * log.positions["load"] if two else None
-        end = round(share * len(log.time)) if log is record else len(log.time)
-        segments = segments_before(log.segments, end)
+        segments = segments_before(log.segments, round((share if log is record else 1.0) * len(log.time)))
         motions.append(TurningLog(log.torque, log.positions["motor"], load, segments, log.sample_period))
     shift = find_zero_shift(*motions)
     if shift is None:
