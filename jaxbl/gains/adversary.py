@@ -27,8 +27,8 @@ _SIGN_MARGIN = 1e-6
 _LANES = 1 << 14
 _LEAST_SAMPLES, _MOST_SAMPLES = 100, 2_000
 """Limits of the samples of a run from rest; it is a little longer than the explored sequence."""
-_SHARE_FROM_START = 0.1
-"""Share of the runs that begin with starting errors and last until the errors have settled."""
+_BATCHES_FROM_START = 10
+"""One batch in so many begins with starting errors, and lasts until the errors have settled."""
 _RATE_RANGE = (1e-3, 0.5)
 """Least and largest rate of switching, or of flips, in a sample."""
 _ROUNDING = 1e-9
@@ -54,7 +54,6 @@ class SearchResult(NamedTuple):
         worst: largest error of the velocity estimate from rest, f⁺ T.
         latest: last sample at which a run from the starting errors was above the settled bound; -1 without one.
         violations: runs with an error above the bound of its sample; the exploration counts as one.
-        sequence: choices that lead from rest to the worst error of the exploration.
     """
 
     runs: int
@@ -62,11 +61,15 @@ class SearchResult(NamedTuple):
     worst: float
     latest: int
     violations: int
-    sequence: Sequence
 
 
-def explore_errors(observer: AbstractSuperTwisting, system: ErrorSystem) -> tuple[Reached, Sequence]:
-    """Explore the errors of an observer that can be reached from rest; x64 must be enabled.
+def _build_observer(system: ErrorSystem) -> AbstractSuperTwisting:
+    kind = DISCRETISATIONS["implicit" if system.implicit else "explicit"]
+    return kind(jnp.asarray(system.lambda_), jnp.asarray(system.alpha))
+
+
+def explore_errors(system: ErrorSystem) -> tuple[Reached, Sequence]:
+    """Explore the errors that can be reached from rest; x64 must be enabled.
 
     Returns the result, and the sequence that leads to the worst error.
     """
@@ -83,7 +86,9 @@ def explore_errors(observer: AbstractSuperTwisting, system: ErrorSystem) -> tupl
         return np.concatenate([extreme, np.full((1, len(states)), noise_bound), np.full((1, len(states)), -noise_bound)])
 
     reached = reachable.explore(
-        reachable.build_error_step(observer), noises, np.column_stack([moment + 0.5 * system.push * nominal, mean])
+        reachable.build_error_step(_build_observer(system)),
+        noises,
+        np.column_stack([moment + 0.5 * system.push * nominal, mean]),
     )
     return reached, Sequence(reached.noise, *(reached.sign * x[reached.push] for x in (mean, moment, nominal)))
 
@@ -148,8 +153,7 @@ def _draw_uniform(bits: Array) -> tuple[Array, Array]:
 @functools.partial(jax.jit, static_argnames="record")
 def _run_adversaries(
     observer: AbstractSuperTwisting,
-    noise_bound: Array,
-    push: Array,
+    system: ErrorSystem,
     lanes: _Adversaries,
     sequence: Sequence,
     bounds: Array,
@@ -177,17 +181,18 @@ def _run_adversaries(
                 velocity_error - lanes.line[i] * observer.lambda_ * root - lanes.line[2 + i] >= 0.0, 1.0, -1.0
             )
             directions.append(jnp.where(lanes.kind == 1, new_signs[i], jnp.where(lanes.kind == 2, steady, feedback)))
-        noise = jnp.where(replay, choices.noise * new_signs[0], -noise_bound * directions[0])
+        noise = jnp.where(replay, choices.noise * new_signs[0], -system.noise * directions[0])
         mean = jnp.where(replay, choices.mean * new_signs[1], directions[1] * lanes.mean)
         moment = 0.5 * directions[1] * lanes.mean + 0.25 * lanes.side * (1.0 - lanes.mean**2)
         moment = jnp.where(replay, choices.moment * new_signs[1], moment)
         nominal = jnp.where(replay, choices.nominal * new_signs[1], lanes.side)
-        state, estimate = observer.step(state, position + noise, lambda _: push * nominal, jnp.ones(()))
+        acceleration = system.push * nominal
+        state, estimate = observer.step(state, position + noise, lambda _: acceleration, jnp.ones(()))
         error = jnp.abs(estimate.velocity - velocity)
         new = (
             state,
-            position + velocity + moment + 0.5 * push * nominal,
-            velocity + mean + push * nominal,
+            position + velocity + moment + 0.5 * acceleration,
+            velocity + mean + acceleration,
             bits,
             tuple(new_signs),
             jnp.maximum(worst, error),
@@ -223,31 +228,29 @@ def search_violations(
         runs: least number of simulated runs; it is rounded up to whole batches.
         seed: random seed.
     """
-    name = "implicit" if system.implicit else "explicit"
     rng, batches = np.random.default_rng(seed), max(1, math.ceil(runs / _LANES))
     with jax.enable_x64(True):
-        observer = DISCRETISATIONS[name](jnp.asarray(system.lambda_), jnp.asarray(system.alpha))
-        explored, best = explore_errors(observer, system)
-        final_bounds = np.full(min(max(_LEAST_SAMPLES, math.ceil(1.2 * len(best.noise))), _MOST_SAMPLES), proof.bounds[-1])
+        observer, (explored, best) = _build_observer(system), explore_errors(system)
+        samples = np.clip(math.ceil(1.2 * len(best.noise)), _LEAST_SAMPLES, _MOST_SAMPLES)
+        final_bounds = np.full(samples, proof.bounds[-1])
         all_bounds = np.concatenate([proof.bounds, final_bounds])
         worst, latest, violations = explored.worst, -1, int(explored.worst > final_bounds[0] * (1.0 + _ROUNDING))
-        bound, push = jnp.asarray(system.noise), jnp.asarray(system.push)
 
         def run(lanes: _Adversaries, limits: np.ndarray, record: bool = False) -> tuple[Any, ...]:
             # repeated until it is as long
             sequence = Sequence(*(np.resize(choices, len(limits)) for choices in best))
             return jax.tree.map(
-                np.asarray, _run_adversaries(observer, bound, push, lanes, sequence, limits, np.asarray(settled), record)
+                np.asarray, _run_adversaries(observer, system, lanes, sequence, limits, np.asarray(settled), record)
             )
 
-        period = round(1.0 / _SHARE_FROM_START)
         for batch in range(batches):
             # batches of both kinds have compiled
             if batch == 1:
                 began = time.monotonic()
-            elif batch == 1 + period:
-                check_cost("a search for a counterexample", 0.0, "", (time.monotonic() - began) * batches / period)
-            from_start = batch % period == 0
+            elif batch == 1 + _BATCHES_FROM_START:
+                seconds = (time.monotonic() - began) * batches / _BATCHES_FROM_START
+                check_cost("a search for a counterexample", 0.0, "", seconds)
+            from_start = batch % _BATCHES_FROM_START == 0
             lanes = _draw_adversaries(rng, system, (position, velocity) if from_start else (0.0, 0.0))
             limits = all_bounds if from_start else final_bounds
             largest, went_above, latest_samples, _ = run(lanes, limits)
@@ -262,4 +265,4 @@ def search_violations(
                 recorded = run(worst_lane, limits, record=True)[3]
                 best = Sequence(*(x[:, 0] for x in recorded))
             worst = max(worst, float(largest.max()))
-    return SearchResult(batches * _LANES, explored.state_count, worst, latest, violations, best)
+    return SearchResult(batches * _LANES, explored.state_count, worst, latest, violations)

@@ -77,11 +77,6 @@ class _OutOfRows(Exception):
     """A set needs more rows than there are."""
 
 
-def root_beyond_sliding(system: ErrorSystem, beyond: np.ndarray) -> np.ndarray:
-    """Return sqrt(r) with r + l sqrt(r) = beyond >= 0, the root term of an innovation outside of the sliding set."""
-    return 2.0 * beyond / np.maximum(system.lambda_ + np.sqrt(system.lambda_**2 + 4.0 * beyond), np.finfo(float).tiny)
-
-
 class _Rows:
     """Rows of a height that divides alpha, and the image of a set; a set is the upper bounds of e, -inf where empty."""
 
@@ -146,12 +141,8 @@ class _Rows:
             target = pushed[shift : shift + len(corrected)]
             np.maximum(target, corrected + moment, out=target)
         largest_innovation = float(np.abs(upper[filled_rows]).max()) + self.system.noise
-        size = (
-            largest_innovation
-            + self.system.lambda_ * math.sqrt(largest_innovation)
-            + 2.0 * self.system.alpha
-            + (last - self.half_count) * self.dg
-        )
+        largest_root, top_row = math.sqrt(largest_innovation), (last - self.half_count) * self.dg
+        size = largest_innovation + self.system.lambda_ * largest_root + 2.0 * self.system.alpha + top_row
         size += float(self.largest_moments[-1])
         new = np.full(len(upper), -np.inf)
         new[first - margin : last + margin] = self._round_up(pushed, size)
@@ -162,42 +153,34 @@ class _Rows:
 
         The lower bounds are minus the mirror image of `high`.
         """
-        system, low, n, i = self.system, -high[::-1], len(high), self.alpha
-        a, noise, top = system.alpha, system.noise, (rows + 1) * self.dg
+        a, noise, lambda_, n, i = self.system.alpha, self.system.noise, self.system.lambda_, len(high), self.alpha
         new = np.full(n + 2 * i, -np.inf)
         # b of this row: from the least e and noise to the largest
-        least, most = low - noise, high + noise
+        least, most = -high[::-1] - noise, high + noise
 
-        def raise_bound(above: int, there: np.ndarray, value: np.ndarray) -> None:
-            part = new[above : above + n]
-            np.maximum(part, np.where(there, value, -np.inf), out=part)
+        def raise_bound(sign: int, there: np.ndarray, b: np.ndarray, phi: np.ndarray) -> None:
+            """Raise bounds where b of this sign is `there`: u = a sign b leads i rows down or up."""
+            part = new[i - sign * i : i - sign * i + n]
+            bound = np.minimum(high, b + noise) + phi + (rows + 1) * self.dg
+            np.maximum(part, np.where(there, bound, -np.inf), out=part)
 
-        def corrected_bound(b: np.ndarray, phi: np.ndarray) -> np.ndarray:
-            return np.minimum(high, b + noise) + phi + top
-
-        if system.implicit:
+        if self.system.implicit:
             # e + phi(b) grows with b while e is b + N, and falls where e is the bound itself
-            b = np.clip(high - noise, np.maximum(least, a), np.maximum(most, a))
-            raise_bound(
-                0,
-                most >= a,
-                corrected_bound(b, -system.lambda_ * root_beyond_sliding(system, np.maximum(b - a, 0.0)) - 2.0 * a),
-            )
-            b = np.clip(high - noise, np.minimum(least, -a), np.minimum(most, -a))
-            raise_bound(
-                2 * i,
-                least <= -a,
-                corrected_bound(b, system.lambda_ * root_beyond_sliding(system, np.maximum(-b - a, 0.0)) + 2.0 * a),
-            )
+            for sign, low, up in ((1, a, np.inf), (-1, -np.inf, -a)):
+                b = np.clip(high - noise, np.clip(least, low, up), np.clip(most, low, up))
+                beyond = np.maximum(sign * b - a, 0.0)
+                # r + l sqrt(r) = beyond
+                root = 2.0 * beyond / np.maximum(lambda_ + np.sqrt(lambda_**2 + 4.0 * beyond), np.finfo(float).tiny)
+                raise_bound(sign, (most >= low) & (least <= up), b, -sign * (lambda_ * root + 2.0 * a))
             self._add_sliding_set(new, high, rows)
             return new
         # convex in b > 0 while e is b + N: largest at an end
         for b in (np.maximum(least, 0.0), np.clip(high - noise, np.maximum(least, 0.0), np.maximum(most, 0.0))):
-            raise_bound(0, most >= 0.0, corrected_bound(b, -system.lambda_ * np.sqrt(b)))
+            raise_bound(1, most >= 0.0, b, -lambda_ * np.sqrt(b))
         # concave in b < 0, largest at -lambda² / 4
-        b = np.clip(np.minimum(high - noise, -0.25 * system.lambda_**2), np.minimum(least, 0.0), np.minimum(most, 0.0))
-        raise_bound(2 * i, least <= 0.0, corrected_bound(b, system.lambda_ * np.sqrt(-b)))
-        raise_bound(i, (least <= 0.0) & (most >= 0.0), corrected_bound(np.zeros(n), np.zeros(n)))
+        b = np.clip(np.minimum(high - noise, -0.25 * lambda_**2), np.minimum(least, 0.0), np.minimum(most, 0.0))
+        raise_bound(-1, least <= 0.0, b, lambda_ * np.sqrt(-b))
+        raise_bound(0, (least <= 0.0) & (most >= 0.0), np.zeros(n), np.zeros(n))
         return new
 
     def _add_sliding_set(self, new: np.ndarray, high: np.ndarray, rows: np.ndarray) -> None:
@@ -266,13 +249,11 @@ def _shrink_to_invariant(
         # an image within its set: all later ones are, too, and bounds only fall; a set of before: bounds recur
         inside_count = inside_count + 1 if (new <= upper).all() else 0
         is_at_rest = inside_count > _TAIL_SAMPLES and bounds[-_TAIL_SAMPLES] <= _TAIL_RATIO * bound
-        period = (
-            1
-            if inside_count and (is_at_rest or (new == upper).all())
-            else k - earlier_sample
-            if (new == earlier).all()
-            else 0
-        )
+        period = 0
+        if inside_count and (is_at_rest or (new == upper).all()):
+            period = 1
+        elif (new == earlier).all():
+            period = k - earlier_sample
         is_coarse = rows.height > height
         if period and not is_coarse:
             least = np.maximum.accumulate(np.array(bounds)[::-1])[::-1]

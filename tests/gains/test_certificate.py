@@ -30,10 +30,10 @@ def _proofs_once(compiled_once):
     """Searches of this file prove and explore the same gains again and again. A thousand runs show what is said of them."""
     results = {}
 
-    def explore_once(observer, system):
+    def explore_once(system):
         key = system, jax.config.jax_enable_x64
         if key not in results:
-            results[key] = explore_errors(observer, system)
+            results[key] = explore_errors(system)
         return results[key]
 
     explore_errors = adversary.explore_errors

@@ -13,7 +13,6 @@ from error_steps import step_errors
 from jaxbl.errors import NoResult
 from jaxbl.gains.adversary import explore_errors
 from jaxbl.gains.invariant_set import ErrorSystem, _Rows, prove
-from jaxbl.observer import ExplicitSuperTwisting
 from jaxbl.observer.conditions import convergence_time_worst
 
 SYSTEMS = [
@@ -144,7 +143,7 @@ def test_forward_euler_with_a_large_lambda_has_a_set():
     system = ErrorSystem(False, 20.0, 1.5, 0.0)
     bound = prove(system, 1.0, 0.0, finest=0.05).bounds[-1]
     with jax.enable_x64(True):
-        worst_errors, _ = explore_errors(ExplicitSuperTwisting(jnp.asarray(20.0), jnp.asarray(1.5)), system)
+        worst_errors, _ = explore_errors(system)
     assert 50.0 < worst_errors.worst <= bound <= 1.1 * worst_errors.worst
 
 
