@@ -88,13 +88,14 @@ def certify(
         >>> certify(2.2, 9.2, **bounds, runs=1)["certified"]
         True
     """
+    position_error = noise if position_error is None else position_error
     assumptions = Assumptions(discretisation, period, f_plus, noise, velocity_error, position_error, acceleration)
-    proven = _prove(lambda_, alpha, assumptions, accuracy)
-    system, start, proof, bounds, proven_accuracy, reaching_sample = proven
-    speed, final_accuracy = f_plus * period, float(bounds[-1])
+    system, start, proof, bounds, proven_accuracy, proven_time, limits = _prove(
+        lambda_, alpha, assumptions, accuracy, reaching_time
+    )
+    speed = f_plus * period
     adversary = search_violations(system, *start, proof, proven_accuracy / speed, runs, seed)
     numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
-    continuous = float(call_in_float64(convergence_time_worst, *numbers))
     samples = np.unique(np.linspace(0, len(bounds) - 1, _CURVE_POINTS).astype(int))
     refusal = None
     if adversary.violations:
@@ -106,11 +107,11 @@ def certify(
         "gains": {"lambda": lambda_, "alpha": alpha},
         "assumptions": assumptions.to_dict(),
         "accuracy": proven_accuracy,
-        "reaching_time": reaching_sample * period,
-        "final_accuracy": final_accuracy,
-        "reaching_time_continuous": continuous,
+        "reaching_time": proven_time,
+        "final_accuracy": bounds[-1],
+        "reaching_time_continuous": call_in_float64(convergence_time_worst, *numbers),
         "resolution": proof.row * speed,
-        "curve": {"time": (samples * period).tolist(), "bound": bounds[samples].tolist()},
+        "curve": {"time": samples * period, "bound": bounds[samples]},
         "search": {
             "runs": adversary.runs,
             "explored": adversary.explored,
@@ -119,7 +120,7 @@ def certify(
             "reaching_time": (adversary.latest + 1) * period,
             "violations": adversary.violations,
         },
-        "limits": _judge_limits(assumptions, proven, accuracy, reaching_time),
+        "limits": limits,
     })  # fmt: skip
 
 
@@ -131,17 +132,12 @@ class Assumptions(NamedTuple):
     f_plus: float
     noise: float
     velocity_error: float
-    position_error: float | None = None
-    acceleration: float = 0.0
-
-    @property
-    def starting_position(self) -> float:
-        """Largest position error at the first sample, rad."""
-        return self.noise if self.position_error is None else self.position_error
+    position_error: float
+    acceleration: float
 
     def to_dict(self) -> JsonObject:
         """The table `assumptions` of a certificate."""
-        assumptions = self._asdict() | {"position_error": self.starting_position}
+        assumptions = self._asdict()
         if self.discretisation == "implicit":
             assumptions.pop("acceleration")
         return assumptions
@@ -156,7 +152,9 @@ class _ScaledProof(NamedTuple):
         proof: the proof in these units.
         bounds: bounds of the velocity error by sample, rad/s.
         accuracy: the bound that is certified, rad/s.
-        reaching_sample: the first sample from which `accuracy` holds.
+        reaching_time: from which `accuracy` holds, s.
+        limits: each limit that was asked for, and whether it is met. The reaching time is that of the accuracy asked for,
+            if this is met.
     """
 
     system: ErrorSystem
@@ -164,26 +162,26 @@ class _ScaledProof(NamedTuple):
     proof: Proof
     bounds: np.ndarray
     accuracy: float
-    reaching_sample: int
+    reaching_time: float
+    limits: JsonObject
 
 
-def _prove(lambda_: float, alpha: float, assumptions: Assumptions, accuracy: float | None) -> _ScaledProof:
+def _prove(
+    lambda_: float, alpha: float, assumptions: Assumptions, accuracy: float | None, reaching_time: float | None
+) -> _ScaledProof:
     f_plus, period = assumptions.f_plus, assumptions.period
     if assumptions.discretisation not in DISCRETISATIONS:
         raise InputError(
             f"discretisation: '{assumptions.discretisation}' is unknown; it should be one of {', '.join(DISCRETISATIONS)}"
         )
-    numbers = assumptions._asdict() | {
-        "lambda": lambda_, "alpha": alpha, "position_error": assumptions.starting_position, "accuracy": accuracy,
-    }  # fmt: skip
-    for name in ("lambda", "alpha", "noise", "velocity_error", "position_error", "acceleration"):
-        value = numbers[name]
-        if not (math.isfinite(value) and value >= 0.0):
-            raise InputError(f"{name}: a certificate needs a finite number >= 0, not {value}")
-    for name in ("f_plus", "period", "accuracy"):
-        value = numbers[name]
-        if value is not None and not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{name}: a certificate needs a finite number > 0, not {value}")
+    numbers = {"lambda": lambda_, "alpha": alpha, "accuracy": accuracy} | assumptions._asdict()
+    del numbers["discretisation"]
+    for name, value in numbers.items():
+        if value is None or (0.0 < value < math.inf):
+            continue
+        is_divisor = name in ("f_plus", "period", "accuracy")
+        if is_divisor or value != 0.0:
+            raise InputError(f"{name}: a certificate needs a finite number {'>' if is_divisor else '>='} 0, not {value}")
     ratio = float(call_in_float64(peak_ratio, lambda_, alpha, f_plus))
     if alpha <= f_plus:
         raise NoResult(f"alpha = {alpha:.4g} rad/s² does not exceed f⁺ = {f_plus:.4g} rad/s²: the error need not shrink")
@@ -196,28 +194,17 @@ def _prove(lambda_: float, alpha: float, assumptions: Assumptions, accuracy: flo
     implicit = assumptions.discretisation == "implicit"
     push = 0.0 if implicit else assumptions.acceleration / f_plus
     system = ErrorSystem(implicit, lambda_ / math.sqrt(f_plus), alpha / f_plus, assumptions.noise / length, push)
-    start = assumptions.starting_position / length, assumptions.velocity_error / speed
+    start = assumptions.position_error / length, assumptions.velocity_error / speed
     proof = prove(system, *start)
     bounds = proof.bounds * speed
     # compared in rad/s: in units of f⁺ T rounding could put the accuracy below the last bound
     proven_accuracy = _SETTLED_RATIO * float(bounds[-1]) if accuracy is None or accuracy < bounds[-1] else accuracy
-    return _ScaledProof(system, start, proof, bounds, proven_accuracy, int((bounds <= proven_accuracy).argmax()))
-
-
-def _judge_limits(
-    assumptions: Assumptions, proven: _ScaledProof, accuracy: float | None, reaching_time: float | None
-) -> JsonObject:
-    """Return each limit that was asked for, and whether the proof meets it.
-
-    The reaching time is that of the accuracy that was asked for, if this is met.
-    """
-    limits: JsonObject = {}
-    if accuracy is not None:
-        limits["accuracy"] = {"asked": accuracy, "met": bool(proven.bounds[-1] <= accuracy)}
-    if reaching_time is not None:
-        is_met = proven.reaching_sample * assumptions.period <= reaching_time
-        limits["reaching_time"] = {"asked": reaching_time, "met": is_met}
-    return limits
+    proven_time = int((bounds <= proven_accuracy).argmax()) * period
+    asked = {"accuracy": (accuracy, bounds[-1]), "reaching_time": (reaching_time, proven_time)}
+    limits = {
+        name: {"asked": limit, "met": bool(proven <= limit)} for name, (limit, proven) in asked.items() if limit is not None
+    }
+    return _ScaledProof(system, start, proof, bounds, proven_accuracy, proven_time, limits)
 
 
 def choose_assumptions(search: GainSearch, side: str, f_plus: float) -> Assumptions:
@@ -262,23 +249,20 @@ def choose_certified_gains(search: GainSearch) -> dict[str, int]:
     for side in search.sides:
         side_table, frame = _side_table(search, side), search.candidates[side]
         feasible_before, passed_over[side] = frame["feasible"].copy(), 0
-        if side_table.accuracy is None and side_table.reaching_time is None:
+        asked = side_table.accuracy, side_table.reaching_time
+        if asked == (None, None):
             continue
-        for attempt in range(_MOST_ATTEMPTS):
-            if not frame["feasible"].any():
-                break
+        pair_count = frame[feasible_before].groupby(["lambda", "alpha"]).ngroups
+        for attempt in range(min(pair_count, _MOST_ATTEMPTS)):
             best = search.best_candidate(side)
             assumptions = choose_assumptions(search, side, best["f_plus"])
             with suppress(NoResult):
-                proven = _prove(best["lambda"], best["alpha"], assumptions, side_table.accuracy)
-                limits = _judge_limits(assumptions, proven, side_table.accuracy, side_table.reaching_time)
+                limits = _prove(best["lambda"], best["alpha"], assumptions, *asked).limits
                 if all(limit["met"] for limit in limits.values()):
                     passed_over[side] = attempt
                     break
             frame.loc[(frame["lambda"] == best["lambda"]) & (frame["alpha"] == best["alpha"]), "feasible"] = False
         else:
-            frame["feasible"] = feasible_before
-        if not frame["feasible"].any():
             frame["feasible"] = feasible_before
     return passed_over
 
