@@ -12,6 +12,7 @@ Reference: A. Levant, Higher-order sliding modes, differentiation and output-fee
 import dataclasses
 import math
 from collections.abc import Iterator
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,11 +104,11 @@ class Law:
 
     @property
     def slope(self) -> float | None:
-        return None if self.fit is None else self.fit.slope
+        return self.fit and self.fit.slope
 
     @property
     def standard_error(self) -> float | None:
-        return None if self.fit is None else self.fit.standard_error
+        return self.fit and self.fit.standard_error
 
     @property
     def in_range(self) -> np.ndarray:
@@ -118,7 +119,7 @@ class Law:
     @property
     def range(self) -> tuple[float, float] | None:
         """Least and largest x of the law."""
-        return None if self.fit is None else (float(self.x_values[self.fit.first]), float(self.x_values[self.fit.last]))
+        return self.fit and (float(self.x_values[self.fit.first]), float(self.x_values[self.fit.last]))
 
     @property
     def agrees(self) -> bool:
@@ -136,8 +137,8 @@ class Law:
             "slope": self.slope,
             "standard_error": self.standard_error,
             "agrees": self.agrees,
-            "halves": None if self.fit is None else list(self.fit.half_slopes),
-            "range": None if self.range is None else list(self.range),
+            "halves": self.fit and self.fit.half_slopes,
+            "range": self.range,
             "points": int(self.in_range.sum()),
             "stops": self.stops,
         }
@@ -165,13 +166,13 @@ def fit_power_law(x: np.ndarray, y: np.ndarray, usable: np.ndarray | None = None
     """
     is_usable = np.isfinite(y) & (y > 0.0) & (True if usable is None else usable)
     log_x, log_y = np.log(x), np.log(np.where(is_usable, y, 1.0))
-    fits = []
-    for first in range(len(x)):
-        for last in range(first + LEAST_POINTS - 1, len(x)):
-            if not is_usable[first : last + 1].all():
-                break
-            if log_x[last] - log_x[first] >= math.log(LEAST_SPAN) * (1.0 - 1e-9):
-                fits.append(_fit_line(log_x, log_y, first, last))
+    fits = [
+        _fit_line(log_x, log_y, first, last)
+        for first, last in combinations(range(len(x)), 2)
+        if last - first >= LEAST_POINTS - 1
+        and log_x[last] - log_x[first] >= math.log(LEAST_SPAN) * (1.0 - 1e-9)
+        and is_usable[first : last + 1].all()
+    ]
     return max(
         (fit for fit in fits if fit is not None),
         key=lambda fit: (round(float(log_x[fit.last] - log_x[fit.first]), 9), -fit.standard_error),
@@ -223,7 +224,7 @@ def accuracy_laws(result: StudyResult, figures: list[FigureTable] | None = None)
         sizes = [name for name in signal_size_columns(figure.value) if name in result.columns]
         # lines without noise and at other periods tell which cause determines the error
         fixed = {path: value for path, value in resolve_where(config, figure).items() if path not in (NOISE, PERIOD)}
-        parts = result.batches([*(axis.path for axis in config.axes), "finite", figure.value, *sizes])
+        parts = result.batches([*config.axis_paths, "finite", figure.value, *sizes])
         frame = pd.concat([filter_rows(part, fixed) for part in parts], ignore_index=True)
         laws += _fit_figure_lines(config, frame, figure, index)
     return laws
@@ -255,6 +256,7 @@ class _FigureLine:
 
     def __init__(self, config: Config, frame: pd.DataFrame, figure: FigureTable, fixed: JsonObject):
         self._config, self._frame, self._figure, self._fixed = config, frame, figure, fixed
+        self._rows = filter_rows(frame, fixed)
         self.x, self.y = self._geometric_means(figure.value)
         self._unknown = np.full(len(self.x), np.nan)
         self._noise, period = (
@@ -272,10 +274,8 @@ class _FigureLine:
 
     def _number_along_line(self, path: str) -> float:
         """Return the number at a path if it is the same along the line, else NaN."""
-        if path in self._fixed:
-            return float(self._fixed[path])
-        if path in self._frame:
-            numbers = filter_rows(self._frame, self._fixed)[path].unique()
+        if path in self._rows:
+            numbers = self._rows[path].unique()
             return float(numbers[0]) if len(numbers) == 1 else math.nan
         section, key = path.split(".")
         return float(getattr(getattr(self._config, section), key))
@@ -286,7 +286,7 @@ class _FigureLine:
         `changes` are fixed values that replace those of the line.
         """
         path, changes = self._figure.x, changes or {}
-        rows = filter_rows(self._frame, self._fixed | changes)
+        rows = filter_rows(self._frame, self._fixed | changes) if changes else self._rows
         if path not in changes:
             rows = rows[rows[path] > 0.0]
         sizes = np.abs(rows[column].astype(float)).where(rows["finite"].astype(bool))
@@ -311,9 +311,9 @@ class _FigureLine:
 
     def _period_exponent(self) -> np.ndarray:
         """Return the exponent of the error in the sampling period at each x, from the nearest other period; NaN without."""
-        period = self._number_along_line(PERIOD)
-        if PERIOD not in self._fixed or not math.isfinite(period):
+        if PERIOD not in self._fixed:
             return self._unknown
+        period = self._fixed[PERIOD]
         other_periods = np.unique(self._frame[PERIOD].to_numpy(float))
         other_periods = other_periods[~np.isclose(other_periods, period, rtol=1e-9, atol=0.0)]
         if not len(other_periods):
@@ -357,22 +357,20 @@ class _FigureLine:
 
     def explain_ends(self, fit: PowerLawFit | None) -> dict[str, str]:
         """Say why the law ends below and above its range; without a law, why there is none."""
-        if not len(self.x):
+        x, y = self.x, self.y
+        if not len(x):
             return {"below": "no points", "above": "no points"}
         if fit is None:
-            ends = {"below": 0, "above": len(self.x) - 1}
+            ends = {"below": 0, "above": len(x) - 1}
             other = "other: no run of points on one line"
             return {key: self._find_other_cause(i, must_dominate=False) or other for key, i in ends.items()}
         stops = {"below": END_OF_SWEEP, "above": END_OF_SWEEP}
         for key, outer, inner in (("below", fit.first - 1, fit.first), ("above", fit.last + 1, fit.last)):
-            if 0 <= outer < len(self.x):
+            if 0 <= outer < len(x):
                 cause = self._find_other_cause(outer, must_dominate=False)
-                stops[key] = cause or f"other: local slope {self._local_slope(outer, inner):.2f}"
+                # z: no minus before a zero
+                stops[key] = cause or f"other: local slope {math.log(y[outer] / y[inner], x[outer] / x[inner]):z.2f}"
         return stops
-
-    def _local_slope(self, i: int, j: int) -> float:
-        # no minus before a zero
-        return round(math.log(self.y[i] / self.y[j], self.x[i] / self.x[j]), 2) + 0.0
 
 
 def _format_times(ratio: float) -> str:
