@@ -18,7 +18,7 @@ from .lines import percent
 from .units import on_a_line
 
 if TYPE_CHECKING:
-    from .config import TuneTable
+    pass
 
 Unit = float | Callable[[float], float]
 """A factor to SI, or a function that gives the SI value."""
@@ -303,7 +303,7 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         InputError: numbers that no study can have together.
         NoResult: the drive diverges.
     """
-    from .config import TuneTable, read_config
+    from .config import read_config
     from .gains.expected_error import expect_errors
     from .gains.gain_search import usual_rule
     from .gains.machine_study import propose_map, propose_tolerances
@@ -311,21 +311,20 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
 
     # by the names that they have on a geared drive
     answers = {item.key or item.name: answers[item.name] for item in kind.items}
-    table = TuneTable(worst_over_uncertainty=True)
     try:
         data = tomllib.loads(_write_drive(kind, answers, title, _choose_amplitude(answers, _HARMONICS)))
-        amplitude, pilot_metrics = _limit_input(data, answers, table)
+        amplitude, pilot_metrics = _limit_input(data, answers)
         _check_motion(kind, pilot_metrics)
         text = _write_drive(kind, answers, title, amplitude)
         chirp = _make_chirp(answers, _choose_amplitude(answers, 1))
-        chirp["amplitude"], _ = _limit_input(data | {"excitation": chirp}, answers, table)
+        chirp["amplitude"], _ = _limit_input(data | {"excitation": chirp}, answers)
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
         config = read_config(tomllib.loads(text) | {"observer": observers})
-        expected = expect_errors(list_scenarios(config, table), list(gains))
+        expected = expect_errors(list_scenarios(config, worst_over_uncertainty=True), list(gains))
         for side, metrics in pilot_metrics.items():
             metrics["expected"] = expected[side]._asdict()
-        gain_map = propose_map(run_pilot(Scenarios(config, ["nominal"], {}), table)["motor"]["f_plus"])
+        gain_map = propose_map(run_pilot(Scenarios(config))["motor"]["f_plus"])
         tolerances = propose_tolerances(config, expected)
         text += _write_observers(kind, answers, pilot_metrics, gains, usual_rule(1.0), chirp, tolerances, gain_map)
         read_config(tomllib.loads(text))
@@ -336,7 +335,7 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
     return text, pilot_metrics
 
 
-def _limit_input(data: JsonObject, answers: Answers, table: "TuneTable") -> tuple[float, JsonObject]:
+def _limit_input(data: JsonObject, answers: Answers) -> tuple[float, JsonObject]:
     """Reduce the amplitude of a study's input until the motor stays within its rated torque and speed.
 
     Returns the amplitude, and the pilot runs with it: of the drive, and of others within the uncertainty of its numbers.
@@ -354,7 +353,8 @@ def _limit_input(data: JsonObject, answers: Answers, table: "TuneTable") -> tupl
     amplitude = data["excitation"]["amplitude"] * min(answers["torque"].value / peak, 1.0)
     while True:
         amplitude = _round(0.995 * amplitude, 3)  # rounded, it is not larger
-        pilot_metrics = run_pilot(list_scenarios(model.with_keys("excitation", amplitude=amplitude), table), table)
+        scenarios = list_scenarios(model.with_keys("excitation", amplitude=amplitude), worst_over_uncertainty=True)
+        pilot_metrics = run_pilot(scenarios)
         speed = pilot_metrics["motor"]["largest_velocity"]
         if speed <= rated:
             return amplitude, pilot_metrics

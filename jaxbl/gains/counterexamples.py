@@ -3,18 +3,15 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false, reportCallIssue=false
 
-import copy
-
 import numpy as np
 import pandas as pd
 
 from jaxbl.config import Config, read_config
-from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.points import Points
 
 from .pilot import list_axes
-from .stages import Stages
+from .stages import Stages, set_keys
 
 _MOST_REPEATED = 4096
 """Runs of a level that are repeated, evenly spread: one chunk of the scan on one device."""
@@ -55,21 +52,6 @@ def _list_remedies(run: JsonObject, level: str) -> dict[str, JsonObject]:
         remedies["quantisation"] = {"encoders.motor_resolution": 0.0, "encoders.load_resolution": 0.0}
         remedies["explicit discretisation"] = {"observer.discretisation": "implicit"}
     return remedies
-
-
-def set_keys(tables: JsonObject, values: JsonObject) -> JsonObject:
-    """Set dotted keys in a copy of a config's tables; None removes a key."""
-    data = copy.deepcopy(tables)
-    for path, value in values.items():
-        *names, key = path.split(".")
-        table = data
-        for name in names:
-            table = table.setdefault(name, {})
-        if value is None:
-            table.pop(key, None)
-        else:
-            table[key] = to_jsonable(value)
-    return data
 
 
 def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stages: Stages) -> pd.Series:

@@ -9,20 +9,12 @@ import pandas as pd
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 
-from .gain_search import GainSearch, grid_ratio
+from .gain_search import LIMITED_COLUMNS, GainSearch, grid_ratio
 
 LEAST_DIFFERENCE = 0.01
 """Smaller relative differences of the error do not count: another noise seed makes as much."""
 
 GAINS = ("lambda", "alpha")
-CONSTRAINT_COLUMNS = {
-    "converged": "converged",
-    "margin_alpha": "margin_alpha",
-    "margin_exact": "margin_exact",
-    "longest_convergence": "convergence_time",
-}
-"""For each constraint the column of the candidates that it limits."""
-_NUMERIC_CONSTRAINTS = {name: column for name, column in CONSTRAINT_COLUMNS.items() if name != "converged"}
 
 _ROUNDING = 1e-9
 """Relative difference up to which two gains are the same."""
@@ -53,15 +45,11 @@ def find_limits(search: GainSearch, side: str) -> JsonObject:
             if judgement["limit"] == "range":
                 ends.append(f"{direction} {gain}")
     constraints = {"converged": {"value": bool(best["converged"]), "binds": "converged" in binding}}
-    for name, column in _NUMERIC_CONSTRAINTS.items():
-        limit = getattr(search.table, name)
-        if limit is not None:
-            ratio = best[column] / limit
-            # at a time of zero the room is unlimited
-            room = ratio if name != "longest_convergence" else 1.0 / ratio if ratio else np.inf
-            constraints[name] = {"value": best[column], "limit": limit, "room": room, "binds": name in binding}
+    for name, room in search.rooms(pd.DataFrame([best])).items():
+        value, limit = best[LIMITED_COLUMNS[name]], getattr(search.table, name)
+        constraints[name] = {"value": value, "limit": limit, "room": room[0], "binds": name in binding}
     profile_lists = {
-        gain: {name: profile[name].tolist() for name in (gain, f"{gain}_ratio", "error", "chatter", "missed")}
+        gain: {name: profile[name] for name in (gain, f"{gain}_ratio", "error", "chatter", "missed")}
         for gain, profile in profiles.items()
     }
     return to_jsonable(
@@ -100,17 +88,13 @@ def _interpolate_line(candidates: pd.DataFrame, gain: str, other: str, other_rat
     ends = [candidates[candidates[f"{other}_ratio"] == rows[k]].sort_values(gain, ignore_index=True) for k in (i - 1, i)]
     if share < _ROUNDING or share > 1.0 - _ROUNDING:
         return ends[round(share)][_COLUMNS]
-    low, high = ends
-
-    def mean(name: str, power: int = 1) -> pd.Series:
-        return ((1.0 - share) * low[name] ** power + share * high[name] ** power) ** (1.0 / power)
-
-    new = {name: mean(name, 2) for name in ("error", "chatter")}
-    new |= {name: mean(name) for name in _NUMERIC_CONSTRAINTS.values()} | {"converged": low["converged"] & high["converged"]}
-    return low[_COLUMNS].assign(**new)
+    (low, high), columns = ends, ["error", "chatter", *LIMITED_COLUMNS.values()]
+    powers = np.where(np.isin(columns, ["error", "chatter"]), 2.0, 1.0)
+    means = ((1.0 - share) * low[columns] ** powers + share * high[columns] ** powers) ** (1.0 / powers)
+    return low[_COLUMNS].assign(**means, converged=low["converged"] & high["converged"])
 
 
-_COLUMNS = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "error", "chatter", *CONSTRAINT_COLUMNS.values()]
+_COLUMNS = ["lambda", "alpha", "lambda_ratio", "alpha_ratio", "error", "chatter", "converged", *LIMITED_COLUMNS.values()]
 
 
 def _judge_direction(search: GainSearch, profile: pd.DataFrame, best: JsonObject, gain: str, sign: int) -> JsonObject:

@@ -8,14 +8,14 @@ Observer and controller gains are searched together, by simulation: quasi-random
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from jaxbl.chain import NamedArrays
-from jaxbl.config import LOOP_OBJECTIVES, Config, TuneTable, numeric_paths
+from jaxbl.config import LOOP_OBJECTIVES, numeric_paths
 from jaxbl.config.study import suggest_path
 from jaxbl.drive.parameters import get_leaf
 from jaxbl.errors import InputError, NoResult
@@ -25,8 +25,8 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.points import draw_sobol
 
 from .observer_choice import LEAST_HELD_OUT_SEEDS, GainValues, SideSearch, rank_kinds
-from .pilot import list_scenarios
-from .stages import GainChoice, Stages, stage_tables
+from .pilot import Scenarios, list_scenarios
+from .stages import GainChoice, Stages
 
 GAIN_SECTIONS = "controller.", "observer.", "equivalent_control."
 """Where the gains of a loop stand."""
@@ -57,30 +57,29 @@ class LoopRuns:
         side: whose position follows the reference.
     """
 
-    def __init__(self, config: Config, table: TuneTable, stages: Stages):
-        assert config.controller is not None
-        self.table, self.stages, self.side = table, stages, config.controller.side
-        self.scenarios, self.experiment = list_scenarios(config, table), config.build()
+    def __init__(self, scenarios: Scenarios, stages: Stages):
+        assert stages.config.controller is not None
+        self.scenarios, self.stages, self.side = scenarios, stages, stages.config.controller.side
+        self.experiment = stages.config.build()
 
-    def read_study_gains(self, paths: Sequence[str]) -> GainValues:
+    def read_study_gains(self, paths: Iterable[str]) -> GainValues:
         """Return the study's own gains."""
         return {path: float(get_leaf(self.experiment, path) or 0.0) for path in paths}
 
-    def simulate(self, name: str, gains: Mapping[str, Sequence[float]], held_out_seeds: int | None = None) -> NamedArrays:
-        """Simulate sets of gains, by path. Returns metrics of `LOOP_OBJECTIVES`, shape (sets, runs), infinite for none."""
-        corners, count = len(self.scenarios.names), len(next(iter(gains.values())))
-        columns = {path: np.repeat(values, corners).tolist() for path, values in gains.items()}
-        columns |= {path: list(values) * count for path, values in self.scenarios.columns.items()}
-        data = stage_tables(self.scenarios.config, name, self.table, held_out_seeds)
+    def simulate(self, name: str, gains: pd.DataFrame, held_out_seeds: int | None = None) -> NamedArrays:
+        """Simulate sets of gains, one a row. Returns metrics of `LOOP_OBJECTIVES`, shape (sets, runs), infinite for none."""
+        corners = pd.DataFrame(self.scenarios.columns, index=range(len(self.scenarios.names)))
+        trials = gains.merge(corners, how="cross")
+        data = self.stages.tables_of(self.scenarios.config, name, held_out_seeds)
         data["sweep"]["metrics"] = metrics = list(LOOP_OBJECTIVES.values())
         names = [f"{self.side}.{metric}" for metric in metrics]
-        values = self.stages.run_trials(data, name, pd.DataFrame(columns), names).values()
+        values = self.stages.run_trials(data, name, trials, names).values()
         return {
-            metric: np.where(np.isnan(runs), np.inf, runs).reshape(count, -1)
+            metric: np.where(np.isnan(runs), np.inf, runs).reshape(len(gains), -1)
             for metric, runs in zip(metrics, values, strict=True)
         }
 
-    def find_margins(self, gains: GainValues, name: str = "margins") -> JsonObject:
+    def find_margins(self, gains: GainValues) -> JsonObject:
         """Find by what factors each gain alone may fall and rise, until the loop no longer holds.
 
         It holds while the following error's range in the last quarter stays within twice the given gains' one, or within the
@@ -88,15 +87,13 @@ class LoopRuns:
         """
         tolerance = self.experiment.run.position_tolerance / self.experiment.drive.ratio(self.side)
 
-        def try_factors(factors: Mapping[Any, np.ndarray], stage: str) -> tuple[dict[Any, np.ndarray], float]:
+        def try_factors(ladders: Mapping[Any, np.ndarray], stage: str) -> tuple[dict[Any, np.ndarray], float]:
             sets = [
-                gains | {path: gains[path] * factor**way} for (path, way), ladder in factors.items() for factor in ladder
+                gains | {path: gains[path] * factor**way} for (path, way), ladder in ladders.items() for factor in ladder
             ]
-            columns = {path: [gains[path], *(values[path] for values in sets)] for path in gains}
-            ranges = self.simulate(f"{name}-{stage}", columns)["limit_cycle_amplitude"].max(axis=1)
+            ranges = self.simulate(f"margins-{stage}", pd.DataFrame([gains, *sets]))["limit_cycle_amplitude"].max(axis=1)
             holds = ranges[1:] <= max(tolerance, 2.0 * ranges[0])
-            ends = np.cumsum([len(ladder) for ladder in factors.values()])
-            return dict(zip(factors, np.split(holds, ends[:-1]), strict=True)), float(ranges[0])
+            return dict(zip(ladders, holds.reshape(len(ladders), -1), strict=True)), float(ranges[0])
 
         holds, given_range = try_factors({(path, way): _COARSE for path in gains for way in (-1, 1)}, "coarse")
         if not np.isfinite(given_range):
@@ -110,39 +107,60 @@ class LoopRuns:
         return {path: {"down": last.get((path, -1)), "up": last.get((path, 1))} for path in gains}
 
 
-def tune_loop(config: Config, table: TuneTable, stages: Stages) -> LoopTuning:
-    """Tune the gains of a closed loop; arguments as of :func:`.tune.tune`.
+def tune_loop(stages: Stages) -> LoopTuning:
+    """Tune the gains of a closed loop.
 
     Raises:
         InputError: a path of `tune.gains` does not exist, or is 0 and has no range.
         NoResult: no gains keep the limits.
     """
     stages.write_manifest()
-    runs, objective = LoopRuns(config, table, stages), LOOP_OBJECTIVES[table.objective]
-    limits = _find_ranges(config, table, runs)
-    study_gains, search = runs.read_study_gains(list(limits)), SideSearch(limits, dict(limits), {}, widest_cell=_ZOOM)
+    config, table = stages.config, stages.table
+    runs = LoopRuns(list_scenarios(config, table.worst_over_uncertainty), stages)
+    objective = LOOP_OBJECTIVES[table.objective]
+    search = SideSearch(_find_ranges(runs), widest_cell=_ZOOM)
+    study_gains = runs.read_study_gains(search.limits)
     stages.total_lanes = (1 + table.refine) * table.trials * config.sweep.seeds * len(runs.scenarios.names)
     tables = []
     for stage in range(1 + table.refine):
-        trials = search.trial_gains(draw_sobol(len(limits), table.trials, stage))
+        trials = search.trial_gains(draw_sobol(len(study_gains), table.trials, stage))
         if stage == 0:
-            trials = {path: np.append(study_gains[path], values) for path, values in trials.items()}
-        worst = {name: values.max(axis=1) for name, values in runs.simulate(f"loop-{stage}", trials).items()}
+            trials = [study_gains, *trials]
+        frame = pd.DataFrame(trials)
+        worst = {name: values.max(axis=1) for name, values in runs.simulate(f"loop-{stage}", frame).items()}
         keeps = (worst["settling_time"] <= (table.longest_settling or np.inf)) & (
             worst["limit_cycle_amplitude"] <= (table.largest_limit_cycle or np.inf)
         )
         errors = np.where(keeps, worst[objective], np.inf)
-        tables.append(pd.DataFrame(trials | worst).assign(stage=stage, error=errors))
+        tables.append(frame.assign(**worst, stage=stage, error=errors))
         search.zoom_in(trials, errors)
     if not search.best:
         raise NoResult("tune: no gains of the loop stay finite and keep longest_settling and largest_limit_cycle")
     best = {path: float(f"{value:.6g}") for path, value in search.best.items()}
-    summary = _summarise(runs, best, study_gains, search) | {"margins": runs.find_margins(best)}
+    seeds = max(config.sweep.seeds, LEAST_HELD_OUT_SEEDS)
+    sets = {"tuned": best} | ({} if best == study_gains else {"study": study_gains})
+    # under other noise
+    metrics = runs.simulate("loop-holdout", pd.DataFrame(list(sets.values())), seeds)
+    summary = stages.describe() | {
+        "objective_metric": f"{runs.side}.{objective} ({SIDE_METRICS[objective].unit})",
+        "gains": best,
+        "trials": table.trials * (1 + table.refine),
+        "held_out_seeds": seeds,
+        "error_in_search": search.error,
+        "at_range_end": search.gains_at_ends(),
+        "compared": {
+            name: {"gains": gains} | {metric: values[i].max() for metric, values in metrics.items()}
+            for i, (name, gains) in enumerate(sets.items())
+        },
+        "ranking": rank_kinds(dict(zip(sets, metrics[objective], strict=True))),
+        "margins": runs.find_margins(best),
+    }
     return LoopTuning(config, to_jsonable(summary), stages.cost, tuple(stages.fallback_reasons), pd.concat(tables))
 
 
-def _find_ranges(config: Config, table: TuneTable, runs: LoopRuns) -> dict[str, tuple[float, float]]:
+def _find_ranges(runs: LoopRuns) -> dict[str, tuple[float, float]]:
     """Return the range of each gain, by path: those of the study, or a decade around each of the observers' gains."""
+    config, table = runs.stages.config, runs.stages.table
     ranges: dict[str, Any] = {gain.path: (gain.start, gain.stop) for gain in table.gains}
     paths = {path: doc for path, doc in numeric_paths(config).items() if path.startswith(GAIN_SECTIONS)}
     for i, path in enumerate(ranges):
@@ -156,27 +174,3 @@ def _find_ranges(config: Config, table: TuneTable, runs: LoopRuns) -> dict[str, 
         low, high = ranges[path]
         ranges[path] = low or min(value, high or value) / _REACH, high or max(value, low or value) * _REACH
     return ranges
-
-
-def _summarise(runs: LoopRuns, best: GainValues, study_gains: GainValues, search: SideSearch) -> JsonObject:
-    """Compare tuned gains with the study's own under other noise: content of `tuning.json`."""
-    config, table = runs.scenarios.config, runs.table
-    objective, seeds = LOOP_OBJECTIVES[table.objective], max(config.sweep.seeds, LEAST_HELD_OUT_SEEDS)
-    sets = {"tuned": best} | ({} if best == study_gains else {"study": study_gains})
-    metrics = runs.simulate("loop-holdout", {path: [gains[path] for gains in sets.values()] for path in best}, seeds)
-    return {
-        "title": config.title,
-        "objective": table.objective,
-        "objective_metric": f"{runs.side}.{objective} ({SIDE_METRICS[objective].unit})",
-        "gains": best,
-        "trials": table.trials * (1 + table.refine),
-        "seeds": [config.sweep.first_seed, config.sweep.first_seed + config.sweep.seeds - 1],
-        "held_out_seeds": seeds,
-        "error_in_search": search.error,
-        "at_range_end": search.gains_at_ends(),
-        "compared": {
-            name: {"gains": gains} | {metric: values[i].max() for metric, values in metrics.items()}
-            for i, (name, gains) in enumerate(sets.items())
-        },
-        "ranking": rank_kinds(dict(zip(sets, metrics[objective], strict=True))),
-    }

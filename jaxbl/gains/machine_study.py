@@ -3,7 +3,7 @@
 import math
 from contextlib import suppress
 
-from jaxbl.config import Config, TuneTable, read_config
+from jaxbl.config import Config, read_config
 from jaxbl.errors import InputError, NoResult
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import doubts_among
@@ -20,12 +20,16 @@ the rms, which one in 400 exceeds, no run of thousands of samples would keep."""
 def propose_map(f_plus: float) -> JsonObject:
     """Propose `axes` and `figures`: a map of the motor observer's gains about f_plus (rad/s^2) and its root."""
     # from well below what convergence asks for to where the encoders' noise rules
-    ranges = (("lambda", math.sqrt(f_plus), (0.2, 100.0)), ("alpha", f_plus, (0.2, 200.0)))
+    ranges = (("lambda", math.sqrt(f_plus), 100.0), ("alpha", f_plus, 200.0))
     axes = [
-        {"path": f"observer.motor.{gain}"}
-        | {name: _round(end * scale) for name, end in zip(("start", "stop"), ends, strict=True)}
-        | {"num": 32, "scale": "log"}
-        for gain, scale, ends in ranges
+        {
+            "path": f"observer.motor.{gain}",
+            "start": _round(0.2 * unit),
+            "stop": _round(largest * unit),
+            "num": 32,
+            "scale": "log",
+        }
+        for gain, unit, largest in ranges
     ]
     figure = {"kind": "heatmap", "x": "observer.motor.alpha", "y": "observer.motor.lambda", "value": "motor.velocity_rmse"}
     return {"axes": axes, "figures": [figure | {"overlays": ["davila_fridman", "seeber_horn", "exact"]}]}
@@ -74,8 +78,8 @@ def complete_study(data: JsonObject, record: Record, written: Config) -> JsonObj
     if "seeds" not in written.sweep.model_fields_set:
         data["sweep"]["seeds"] = 4  # what noise does shows only in several runs
     with suppress(InputError, NoResult):
-        scenarios = Scenarios(read_config(data), ["nominal"], {})
-        pilot = run_pilot(scenarios, TuneTable())
+        scenarios = Scenarios(read_config(data))
+        pilot = run_pilot(scenarios)
         tolerances = propose_tolerances(scenarios.config, expect_errors(scenarios, list(pilot)))
         data["run"] |= {key: value for key, value in tolerances.items() if key not in written.run.model_fields_set}
         if not written.axes and pilot["motor"]["f_plus"] > 0.0:

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.chain import NamedArrays
-from jaxbl.config import Config, TuneTable, with_values
+from jaxbl.config import with_values
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import percent
@@ -28,7 +28,7 @@ from jaxbl.sweeps.metrics import SIDE_METRICS, no_disturbance_error
 from jaxbl.sweeps.points import Points, draw_sobol
 
 from .pilot import Scenarios, list_scenarios, run_pilot
-from .stages import GainChoice, Stages, describe_holdout, stage_tables
+from .stages import GainChoice, Stages, set_keys
 
 TIME_CONSTANT = "equivalent_control.time_constant"
 """Searched together with the gains if the torque is the objective: its estimate is behind this low-pass."""
@@ -54,37 +54,39 @@ class SideSearch:
 
     Attributes:
         limits: ends of the range of each gain, by config path.
-        window: the part of it that is searched next.
+        widest_cell: most half width of the next window, as a share of the last one on a log scale.
+        window: the part of the ranges that is searched next.
         best: gains with the least error so far.
         error: the least error so far.
         error_before: the error before the last zoom.
-        widest_cell: most half width of the next window, as a share of the last one on a log scale.
+        held_out: errors of the best gains on held-out runs, the worst over the scenarios, shape (held-out seeds,);
+            infinite if there are none.
     """
 
     limits: dict[str, tuple[float, float]]
-    window: dict[str, tuple[float, float]]
-    best: GainValues
+    widest_cell: float = 1.0
+    best: GainValues = dataclasses.field(default_factory=dict)
     error: float = math.inf
     error_before: float = math.inf
-    widest_cell: float = 1.0
+    held_out: Any = math.inf
 
-    def trial_gains(self, unit: np.ndarray) -> NamedArrays:
-        """Return the values of each gain at points of the unit cube, shape (trials, free gains)."""
-        gains, column = {}, 0
-        for path, (low, high) in self.window.items():
-            if low == high:
-                gains[path] = np.full(len(unit), low)
-                continue
-            gains[path] = low * (high / low) ** unit[:, column]
-            column += 1
-        return gains
+    def __post_init__(self):
+        self.window = dict(self.limits)
 
-    def zoom_in(self, trials: NamedArrays, errors: np.ndarray) -> None:
+    def trial_gains(self, unit: np.ndarray) -> list[GainValues]:
+        """Return the gains at points of the unit cube, shape (trials, free gains)."""
+        columns = iter(unit.T)
+        gains = {
+            path: low * (high / low) ** next(columns) if low < high else np.full(len(unit), low)
+            for path, (low, high) in self.window.items()
+        }
+        return pd.DataFrame(gains).to_dict("records")
+
+    def zoom_in(self, trials: Sequence[GainValues], errors: np.ndarray) -> None:
         """Store the best of the trials, and zoom in on it: to two cells of a grid with as many points."""
         self.error_before, best_trial = self.error, int(np.argmin(errors))
         if errors[best_trial] < self.error:
-            self.error = float(errors[best_trial])
-            self.best = {path: float(values[best_trial]) for path, values in trials.items()}
+            self.error, self.best = float(errors[best_trial]), trials[best_trial]
         if not self.best:
             return
         free = [path for path, (low, high) in self.window.items() if low < high]
@@ -96,9 +98,11 @@ class SideSearch:
     def gains_at_ends(self) -> list[str]:
         """Return the gains whose best value is at an end of their range."""
         return [
-            path for path, (low, high) in self.limits.items()
-            if low < high and min(self.best[path] / low, high / self.best[path]) < (high / low) ** 0.01
-        ]  # fmt: skip
+            path
+            for path, value in self.best.items()
+            for low, high in [self.limits[path]]
+            if low < high and min(value / low, high / value) < (high / low) ** 0.01
+        ]
 
 
 class MapPoint(NamedTuple):
@@ -110,8 +114,6 @@ class MapPoint(NamedTuple):
         scenarios: drives that the observers must serve.
         pilot: results of the pilot run by side.
         searches: by kind, the sides' searches.
-        held_out: by kind and side, the errors of the tuned observers on held-out runs, shape (held-out seeds,), the worst
-            over the scenarios.
     """
 
     values: JsonObject
@@ -119,31 +121,28 @@ class MapPoint(NamedTuple):
     scenarios: Scenarios
     pilot: JsonObject
     searches: dict[str, dict[str, SideSearch]]
-    held_out: dict[str, NamedArrays]
 
 
-def choose_observer(config: Config, table: TuneTable, stages: Stages) -> ObserverChoice:
-    """Tune and compare the kinds `table.observers`; arguments as of :func:`.tune.tune`."""
-    search = _KindSearch(config, table, stages)
-    for kind in table.observers:
+def choose_observer(stages: Stages) -> ObserverChoice:
+    """Tune and compare the kinds `tune.observers`."""
+    search = _KindSearch(stages)
+    for kind in stages.table.observers:
         search.tune(kind)
-    for kind in table.observers:
-        search.run_held_out(kind)
-    return ObserverChoice(config, _summary(search), stages.cost, tuple(stages.fallback_reasons))
+    return ObserverChoice(stages.config, _summary(search), stages.cost, tuple(stages.fallback_reasons))
 
 
 class _KindSearch:
     """Searches of all kinds at all points."""
 
-    def __init__(self, config: Config, table: TuneTable, stages: Stages):
-        self.config, self.table, self.stages = config, table, stages
-        self.sides = config.build().sides
-        self.seeds = config.sweep.seeds
-        self.held_out_seeds = max(self.seeds, LEAST_HELD_OUT_SEEDS)
-        self.groups = _group_points(config, table, stages)
+    def __init__(self, stages: Stages):
+        self.stages, self.table, self.sides = stages, stages.table, stages.config.sides
+        seeds = stages.config.sweep.seeds
+        self.held_out_seeds = max(seeds, LEAST_HELD_OUT_SEEDS)
+        self.groups = _group_points(stages)
+        self.trials = self.table.trials * (1 + self.table.refine)
         rows = sum(len(point.scenarios.names) for point in chain.from_iterable(self.groups))
-        runs = len(table.observers) * rows * len(self._side_sets())
-        stages.total_lanes = runs * (table.trials * (1 + table.refine) * self.seeds + self.held_out_seeds)
+        runs = len(self.table.observers) * rows * len(self._side_sets())
+        stages.total_lanes = runs * (self.trials * seeds + self.held_out_seeds)
 
     def _side_sets(self) -> list[tuple[str, ...]]:
         """Return the sets of sides that are searched in the same runs.
@@ -153,17 +152,15 @@ class _KindSearch:
         return [(side,) for side in self.sides] if self.table.objective == "torque" else [self.sides]
 
     def tune(self, kind: str) -> None:
-        """Find the gains of a kind on both sides, at all points."""
-        for point in chain.from_iterable(self.groups):
-            point.searches[kind] = self._start_searches(kind, point)
+        """Find the gains of a kind on both sides, and their held-out errors, at all points."""
         for number, points in enumerate(self.groups):
-            searches = [point.searches[kind] for point in points]
+            searches = [self._start_searches(kind, point) for point in points]
             free = sum(low < high for low, high in searches[0][self.sides[0]].limits.values())
             for stage in range(1 + self.table.refine):
                 unit = draw_sobol(free, self.table.trials, stage)
                 trials = [{side: search.trial_gains(unit) for side, search in sides.items()} for sides in searches]
                 rows = [
-                    (point, {side: {path: float(v[j]) for path, v in gains.items()} for side, gains in sides.items()})
+                    (point, {side: gains[j] for side, gains in sides.items()})
                     for point, sides in zip(points, trials, strict=True)
                     for j in range(len(unit))
                 ]
@@ -171,31 +168,25 @@ class _KindSearch:
                     worst = errors.max(axis=1).reshape(len(searches), len(unit))
                     for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
                         sides[side].zoom_in(trial[side], trial_errors)
-
-    def run_held_out(self, kind: str) -> None:
-        """Find the held-out errors of a tuned kind on all sides, at all points."""
-        for number, points in enumerate(self.groups):
-            rows = [(point, {side: point.searches[kind][side].best for side in self.sides}) for point in points]
-            rows = [(point, best) for point, best in rows if all(best.values())]
-            errors = self._run_trials(kind, f"{number}-holdout", rows, held_out=True) if rows else {}
-            for i, (point, _) in enumerate(rows):
-                point.held_out[kind] = {side: errors[side][i] for side in self.sides}
+            found = [point for point in points if all(search.best for search in point.searches[kind].values())]
+            rows = [(point, {side: search.best for side, search in point.searches[kind].items()}) for point in found]
+            errors_by_side = self._run_trials(kind, f"{number}-holdout", rows, held_out=True) if rows else {}
+            for side, errors in errors_by_side.items():
+                for point, held_out in zip(found, errors, strict=True):
+                    point.searches[kind][side].held_out = held_out
 
     def _start_searches(self, kind: str, point: MapPoint) -> dict[str, SideSearch]:
         """Start the searches of a kind at a point, one per side, with the ranges of its gains."""
-        config, searches = point.scenarios.config, {}
+        config = point.scenarios.config
+        encoders, period = config.encoders.build(), config.run.sample_period
+        searches = point.searches[kind] = {}
         for side in self.sides:
-            bound = point.pilot[side]["f_plus"]
-            if not bound > 0.0:
-                raise no_disturbance_error(side)
-            encoders = config.encoders.build()
             noise = math.hypot(encoders.noise, _ROUNDING_RMS * encoders.resolution_of(side))
-            period = config.run.sample_period
-            ranges = OBSERVERS[kind].gain_ranges(OperatingConditions(bound, period, noise))
+            ranges = OBSERVERS[kind].gain_ranges(OperatingConditions(point.pilot[side]["f_plus"], period, noise))
             limits = {f"observer.{side}.{gain}": ends for gain, ends in ranges.items()}
             if self.table.objective == "torque":
                 limits[TIME_CONSTANT] = period / 3.0, 1e3 * period
-            searches[side] = SideSearch(limits, dict(limits), {})
+            searches[side] = SideSearch(limits)
         return searches
 
     def _run_trials(
@@ -223,8 +214,13 @@ class _KindSearch:
                 for corner in range(len(point.scenarios.names))
             ])  # fmt: skip
             stage = f"{kind}-{'-'.join(sides)}-{name}"
-            tables = stage_tables(rows[0][0].scenarios.config, stage, self.table, self.held_out_seeds if held_out else None)
-            tables["observer"] = _observer_table(kind, tables["observer"], trials.iloc[0].to_dict())
+            config, seeds = rows[0][0].scenarios.config, self.held_out_seeds if held_out else None
+            tables = self.stages.tables_of(config, stage, seeds)
+            starts = {side: {"position_error": tables["observer"][side]["position_error"]} for side in self.sides}
+            tables["observer"] |= {"kind": kind} | starts
+            # gains of the kind, in place of the study's
+            first = {path: value for path, value in trials.iloc[0].items() if path.startswith("observer.")}
+            tables = set_keys(tables, first)
             columns = [f"{side}.{metric}" for side in sides for metric in names]
             metrics = self.stages.run_trials(tables, stage, trials, columns)
             for side in sides:
@@ -237,20 +233,9 @@ class _KindSearch:
         return errors_by_side
 
 
-def _observer_table(kind: str, study_table: Mapping[str, Any], trial: Mapping[str, Any]) -> JsonObject:
-    """Return the `[observer]` table of a kind, with a trial's gains."""
-    data: JsonObject = {key: value for key, value in study_table.items() if not isinstance(value, Mapping)}
-    data["kind"] = kind
-    for path, value in trial.items():
-        section, _, side_key = path.partition(".")
-        if section == "observer":
-            side, key = side_key.split(".")
-            data.setdefault(side, {"position_error": study_table[side]["position_error"]})[key] = value
-    return data
-
-
-def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[list[MapPoint]]:
+def _group_points(stages: Stages) -> list[list[MapPoint]]:
     """Group the points of the map by what is fixed at compile time, with a pilot run for each plant."""
+    config, table = stages.config, stages.table
     grid = config.sweep.model_copy(update={"design": "grid", "points": None, "refine": None, "metrics": None})
     points = Points(config.model_copy(update={"axes": table.axes, "sweep": grid}))
     stored_pilots: JsonObject = dict(stages.manifest.get("pilots", {}))
@@ -260,15 +245,17 @@ def _group_points(config: Config, table: TuneTable, stages: Stages) -> list[list
         map_points = []
         for i in range(points.group_size):
             lane = {path: to_jsonable(column[i]) for path, column in columns.items()}
-            config_there = with_values(group.config, lane)
-            scenarios = list_scenarios(config_there, table)
-            # encoders change nothing of the plant
-            key = repr({path: v for path, v in (group.structural | lane).items() if not path.startswith("encoders.")})
-            if key not in pilots:
-                pilots[key] = stored_pilots.get(key) or run_pilot(scenarios, table)
+            scenarios = list_scenarios(with_values(group.config, lane), table.worst_over_uncertainty)
             values = group.structural | lane
+            # encoders change nothing of the plant
+            key = repr({path: value for path, value in values.items() if not path.startswith("encoders.")})
+            if key not in pilots:
+                pilots[key] = stored_pilots.get(key) or run_pilot(scenarios, table.holdout)
+                for side, pilot in pilots[key].items():
+                    if not pilot["f_plus"] > 0.0:
+                        raise no_disturbance_error(side)
             point_values = {axis.path: values[axis.path] for axis in table.axes}
-            map_points.append(MapPoint(point_values, lane, scenarios, pilots[key], {}, {}))
+            map_points.append(MapPoint(point_values, lane, scenarios, pilots[key], {}))
         groups.append(map_points)
     if stored_pilots != pilots:
         stages.write_manifest(pilots=pilots)
@@ -279,13 +266,15 @@ def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, JsonObject]:
     """Rank kinds by their error, least first, with the ratio to the best kind's error.
 
     Args:
-        errors: errors by kind, shape (runs,), from the same runs; positive or infinite.
+        errors: errors by kind, shape (runs,), from the same two runs or more; positive or infinite.
 
     Returns:
         By kind: `error` (geometric mean over the runs), `worst`, and `ratio`, the geometric mean of the ratios to the best
         kind's error in the same run, with its 95 % interval `low` ... `high` (Student's t on the logarithms). All are None
         for a kind with an infinite error.
     """
+    from scipy.stats import t  # slow to load
+
     logs = {
         kind: np.log(np.maximum(kind_errors, np.finfo(float).tiny))
         for kind, kind_errors in errors.items()
@@ -295,12 +284,8 @@ def rank_kinds(errors: Mapping[str, np.ndarray]) -> dict[str, JsonObject]:
     ranking: dict[str, JsonObject] = {}
     for kind in order:
         log_ratios = logs[kind] - logs[order[0]]
-        half = 0.0
-        if len(log_ratios) > 1:
-            from scipy.stats import t  # slow to load
-
-            quantile = float(t.ppf(0.5 * (1.0 + _CONFIDENCE), len(log_ratios) - 1))
-            half = quantile * float(log_ratios.std(ddof=1)) / math.sqrt(len(log_ratios))
+        quantile = float(t.ppf(0.5 * (1.0 + _CONFIDENCE), len(log_ratios) - 1))
+        half = quantile * float(log_ratios.std(ddof=1)) / math.sqrt(len(log_ratios))
         mean = float(log_ratios.mean())
         ranking[kind] = {
             "error": math.exp(float(logs[kind].mean())),
@@ -326,12 +311,11 @@ def runs_are_equal(rank: Mapping[str, Any]) -> bool:
 
 def _summary(search: _KindSearch) -> JsonObject:
     """Return the content of `tuning.json`."""
-    config, table, points = search.config, search.table, []
-    none = np.full(search.held_out_seeds, np.inf)
+    stages, table, points = search.stages, search.table, []
     for point in chain.from_iterable(search.groups):
         sides = {}
         for side in search.sides:
-            ranking = rank_kinds({kind: point.held_out.get(kind, {}).get(side, none) for kind in table.observers})
+            ranking = rank_kinds({kind: searches[side].held_out for kind, searches in point.searches.items()})
             for kind, rank in ranking.items():
                 rank |= _describe_search(point.searches[kind][side], side)
             best = next(iter(ranking))
@@ -342,37 +326,29 @@ def _summary(search: _KindSearch) -> JsonObject:
                 "kinds": ranking,
             }
         points.append({"values": point.values, "sides": sides})
-    first = config.sweep.first_seed
-    summary = {
-        "title": config.title,
-        "objective": table.objective,
+    summary = stages.describe() | {
         "objective_metric": f"{table.objective}_rmse ({SIDE_METRICS[f'{table.objective}_rmse'].unit})",
         "observers": table.observers,
-        "trials": table.trials * (1 + table.refine),
-        "seeds": [first, first + search.seeds - 1],
+        "trials": search.trials,
         "scenarios": search.groups[0][0].scenarios.names,
         "axes": [axis.path for axis in table.axes],
-        "holdout": describe_holdout(config, table, search.held_out_seeds),
+        "holdout": stages.describe_holdout(search.held_out_seeds),
         "points": points,
+        "remarks": [*stages.config.notes, *_remarks(search, points)],
     }
     if len(points) == 1:
         summary["for_both_sides"] = _for_both_sides(points[0]["sides"], table.observers)
-    return to_jsonable(summary) | {"remarks": [*config.notes, *_remarks(search, points)]}
+    return to_jsonable(summary)
 
 
 def _describe_search(side: SideSearch, name: str) -> JsonObject:
     """Describe the search of a kind: its gains by key, its error, the gain by the last zoom, and gains at range ends."""
-    gains = {path.removeprefix(f"observer.{name}."): value for path, value in side.best.items()}
-    last = (
-        (side.error_before - side.error) / side.error_before
-        if math.isfinite(side.error_before) and side.error_before
-        else None
-    )
     return {
-        "gains": gains,
+        "gains": {path.removeprefix(f"observer.{name}."): value for path, value in side.best.items()},
         "error_in_search": side.error,
-        "gained_by_last_zoom": last,
-        "at_range_end": [path.removeprefix(f"observer.{name}.") for path in side.gains_at_ends()] if side.best else [],
+        # NaN without a zoom
+        "gained_by_last_zoom": side.error_before and (side.error_before - side.error) / side.error_before,
+        "at_range_end": [path.removeprefix(f"observer.{name}.") for path in side.gains_at_ends()],
     }
 
 
@@ -405,8 +381,8 @@ def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[s
         ends = Counter((kind, key) for kind, rank in ranks for key in rank["at_range_end"])
         unfinished: dict[str, list[float]] = {}
         for kind, rank in ranks:
-            if (gained := rank["gained_by_last_zoom"] or 0.0) > _UNFINISHED_SHARE:
-                unfinished.setdefault(kind, []).append(gained)
+            if rank["gained_by_last_zoom"] > _UNFINISHED_SHARE:
+                unfinished.setdefault(kind, []).append(rank["gained_by_last_zoom"])
         share = f"of {len(points)} points" if len(points) > 1 else ""
         if ends:
             gains = ", ".join(f"{kind}.{key}{f' ({n} {share})' if share else ''}" for (kind, key), n in ends.items())

@@ -3,14 +3,14 @@
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxbl.chain import Experiment, Reducer, Signals, scan
-from jaxbl.config import Config, TuneTable, precision, prepare, read_config
+from jaxbl.config import Config, precision, prepare, read_config
 from jaxbl.drive.effects import correction_of
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError, NoResult
@@ -22,17 +22,17 @@ class Scenarios(NamedTuple):
     """The drives that gains must serve: a config with their effects, their names, and the effects' values by path."""
 
     config: Config
-    names: list[str]
-    columns: dict[str, list[float]]
+    names: Sequence[str] = ("nominal",)
+    columns: Mapping[str, list[float]] = MappingProxyType({})
 
 
-def list_scenarios(config: Config, table: TuneTable) -> Scenarios:
-    """List the nominal drive and the corners of its uncertain inertias and viscous frictions.
+def list_scenarios(config: Config, worst_over_uncertainty: bool) -> Scenarios:
+    """List the nominal drive and, if asked, the corners of its uncertain inertias and viscous frictions.
 
     In a corner both sides err alike. The corners are effects: the plant has them, the observers do not know them.
     """
-    if not table.worst_over_uncertainty:
-        return Scenarios(config, ["nominal"], {})
+    if not worst_over_uncertainty:
+        return Scenarios(config)
     data, relative = config.to_dict(), config.uncertainty.relative
     effects: list[JsonObject] = data.setdefault("effects", [])
     errors_by_number: dict[str, list[tuple[int, str, float]]] = {}
@@ -53,14 +53,10 @@ def list_scenarios(config: Config, table: TuneTable) -> Scenarios:
             indices = [len(effects) - 1]
         errors_by_number.setdefault(number, []).append((indices[0], key, relative * nominal))
     if not errors_by_number:
-        return Scenarios(config, ["nominal"], {})
-    corners = [
-        dict.fromkeys(errors_by_number, 0),
-        *(
-            dict(zip(errors_by_number, signs, strict=True))
-            for signs in itertools.product((-1, 1), repeat=len(errors_by_number))
-        ),
-    ]
+        return Scenarios(config)
+    count = len(errors_by_number)
+    signs_by_corner = [(0,) * count, *itertools.product((-1, 1), repeat=count)]
+    corners = [dict(zip(errors_by_number, signs, strict=True)) for signs in signs_by_corner]
     kinds = [effect["kind"] for effect in effects]
     columns = {}
     for number, errors in errors_by_number.items():
@@ -74,9 +70,8 @@ def list_scenarios(config: Config, table: TuneTable) -> Scenarios:
     ]
     # uncertainty.exact may name effects by labels that have changed
     data.pop("uncertainty")
-    return Scenarios(
-        read_config(data).model_copy(update={"uncertainty": config.uncertainty}), ["nominal", *names[1:]], columns
-    )
+    config = read_config(data).model_copy(update={"uncertainty": config.uncertainty})
+    return Scenarios(config, ("nominal", *names[1:]), columns)
 
 
 def list_axes(columns_by_label: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[JsonObject]:
@@ -121,9 +116,7 @@ def _update_extremes(
 _EXTREMES = Reducer(
     lambda experiment: {side: _Extremes(*[jnp.zeros_like(experiment.run.sample_period)] * 4) for side in experiment.sides},
     _update_extremes,
-    lambda experiment, totals, state: {
-        f"{side}.{n}": v for side, extremes in totals.items() for n, v in extremes._asdict().items()
-    },
+    lambda experiment, totals, state: totals,
 )
 
 
@@ -139,11 +132,9 @@ def _find_extremes(scenarios: Scenarios, excitation: Any = None) -> dict[str, di
             return scan(set_leaves(experiment, values), jnp.asarray(0), (_EXTREMES,))[0]
 
         columns = {path: jnp.asarray(column, config.run.precision) for path, column in scenarios.columns.items()}
-        maxima = jax.jit(jax.vmap(run_scenario) if columns else run_scenario)(columns)
-        extremes_by_side = {
-            side: {name: float(np.max(np.asarray(maxima[f"{side}.{name}"]))) for name in _Extremes._fields}
-            for side in experiment.sides
-        }
+        extremes = jax.jit(jax.vmap(run_scenario) if columns else run_scenario)(columns)
+        largest = jax.tree.map(lambda values: float(values.max()), extremes)
+        extremes_by_side = {side: largest[side]._asdict() for side in experiment.sides}
     for side, extremes in extremes_by_side.items():
         if not all(map(math.isfinite, extremes.values())):
             raise NoResult(f"{side}: the drive itself diverges in the pilot run: there is nothing to observe")
@@ -153,8 +144,8 @@ def _find_extremes(scenarios: Scenarios, excitation: Any = None) -> dict[str, di
     return extremes_by_side
 
 
-def run_pilot(scenarios: Scenarios, table: TuneTable) -> JsonObject:
-    """Find f_plus (rad/s^2) by side from pilot runs: for the study's excitation and for the held-out one.
+def run_pilot(scenarios: Scenarios, holdout: Any = None) -> JsonObject:
+    """Find f_plus (rad/s^2) by side from pilot runs: for the study's excitation and for the held-out one, if another.
 
     The acceleration that an observer's model lacks is the disturbance, plus viscous friction times the velocity error. The
     latter is largest at the start and vanishes within some samples. So f_plus is the larger of two numbers: the largest
@@ -162,7 +153,7 @@ def run_pilot(scenarios: Scenarios, table: TuneTable) -> JsonObject:
     not count: it brakes the error, and gains for it would suit a drive that nobody has.
     """
     config, study_extremes, pilot_by_side = scenarios.config, _find_extremes(scenarios), {}
-    holdout_extremes = study_extremes if table.holdout is None else _find_extremes(scenarios, table.holdout)
+    holdout_extremes = study_extremes if holdout is None else _find_extremes(scenarios, holdout)
     for side, extremes in study_extremes.items():
         observer = getattr(config.observer, side)
         assumed = observer.position_error == 0.0 and observer.velocity_error == 0.0

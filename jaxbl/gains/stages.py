@@ -1,5 +1,6 @@
 """A command that runs several studies, one after the other: their folder, backend, progress and cost."""
 
+import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -12,7 +13,7 @@ from jaxbl.chain import NamedArrays
 from jaxbl.cluster import Cluster, Scheduler, connect
 from jaxbl.config import Config, TuneTable
 from jaxbl.errors import InputError
-from jaxbl.files import ResultFolder, lock_folder, make_folder, to_path
+from jaxbl.files import ResultFolder, lock_folder, make_folder, to_jsonable, to_path
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps import parts
 from jaxbl.sweeps.programs import Backend, check_backend, share_programs
@@ -58,39 +59,27 @@ def open_stages(
         yield Stages(config, command, out, cluster=stack.enter_context(connect(scheduler)), **options)
 
 
-def stage_tables(config: Config, name: str, table: TuneTable, held_out_seeds: int | None = None) -> JsonObject:
-    """Return the tables of a stage's study: those of `config` without its axes and evaluation.
-
-    Held-out runs have so many other seeds, and the excitation `holdout` of the table if it has one.
-    """
-    data = config.to_dict()
-    for key in ("notes", "figures", "tune", "uncertainty", "axes"):
-        data.pop(key, None)
-    data["title"] = f"{config.title} ({name})" if config.title else name
-    chunk = {} if config.sweep.chunk is None else {"chunk": config.sweep.chunk}
-    data["sweep"] = {"seeds": config.sweep.seeds, "first_seed": config.sweep.first_seed} | chunk
-    if held_out_seeds is not None:
-        data["sweep"] |= {"seeds": held_out_seeds, "first_seed": config.sweep.first_seed + config.sweep.seeds}
-        if table.holdout is not None:
-            data["excitation"] = table.holdout.model_dump(by_alias=True, exclude_none=True)
+def set_keys(tables: JsonObject, values: JsonObject) -> JsonObject:
+    """Set dotted keys in a copy of a config's tables; None removes a key."""
+    data = copy.deepcopy(tables)
+    for path, value in values.items():
+        *names, key = path.split(".")
+        table = data
+        for name in names:
+            table = table.setdefault(name, {})
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = to_jsonable(value)
     return data
 
 
-def describe_holdout(config: Config, table: TuneTable, seeds: int) -> JsonObject:
-    """Describe the held-out runs of :func:`stage_tables` for `tuning.json`."""
-    first = config.sweep.first_seed + config.sweep.seeds
-    return {
-        "excitation": (table.holdout or config.excitation).model_dump(by_alias=True, exclude_none=True),
-        "same_excitation": table.holdout is None,
-        "seeds": [first, first + seeds - 1],
-    }
-
-
+@dataclasses.dataclass
 class Stages:
     """The studies that `tune` or `verify` runs, stored in the folder `out`/`command`; nothing is stored without `out`.
 
     Attributes:
-        folder: `out`/`command`, or None.
+        table: what the study asks of gains.
         results: the folder `out` with its manifest, or None.
         manifest: entry of the command in the manifest, of an earlier call at first.
         total_lanes: lanes of all stages, for the progress.
@@ -101,55 +90,80 @@ class Stages:
         InputError: the folder holds something else, or was begun with another backend.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        command: str,
-        out: str | Path | None = None,
-        progress: Progress | None = None,
-        devices: list[Any] | None = None,
-        overwrite: bool = False,
-        backend: Backend | None = None,
-        cluster: Cluster | None = None,
-    ):
-        self.folder: Path | None = None
-        self._cluster = cluster
-        self.devices = devices
+    config: Config
+    command: str
+    out: str | Path | None = None
+    progress: Progress | None = None
+    devices: list[Any] | None = None
+    overwrite: bool = False
+    backend: Backend | None = None
+    cluster: Cluster | None = None
+
+    def __post_init__(self):
+        check_backend(self.backend)
+        self.table = self.config.tune or TuneTable()
+        self.results: ResultFolder | None = None
         self.manifest: JsonObject = {}
-        self.total_lanes = 0
+        self.total_lanes = self._finished_lanes = 0
         self.fallback_reasons: dict[str, None] = {}
         self.cost = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0.0}
-        self._config, self._command, self._progress, self._overwrite = config, command, progress, overwrite
-        self._backend: Backend | None = check_backend(backend)
-        self._finished_lanes = 0
-        self.results: ResultFolder | None = None
-        if out is None:
+        if self.out is None:
             return
-        self.results = claim_study(to_path(out), config, command, overwrite=overwrite)
-        self.folder = self.results.path / command
-        self.manifest = self.results.entries.get(command, {})
-        earlier_backend = self.manifest.get("backend")
-        if self.manifest and backend not in (None, earlier_backend):
+        self.results = claim_study(to_path(self.out), self.config, self.command, overwrite=self.overwrite)
+        self.manifest = self.results.entries.get(self.command, {})
+        if not self.manifest:
+            return
+        earlier_backend = check_backend(self.manifest.get("backend"))
+        if self.backend not in (None, earlier_backend):
             before = f"with --backend {earlier_backend}; go on with that"
             if not earlier_backend:
                 before = "without --backend; go on without it"
-            raise InputError(f"{out}: was begun {before}, or choose another folder with --out")
-        if self.manifest:
-            self._backend = check_backend(earlier_backend)
+            raise InputError(f"{self.out}: was begun {before}, or choose another folder with --out")
+        self.backend = earlier_backend
+
+    def describe(self) -> JsonObject:
+        """Describe the search for `tuning.json`: its title, objective, and first and last seed."""
+        first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
+        return {"title": self.config.title, "objective": self.table.objective, "seeds": [first, first + seeds - 1]}
+
+    def describe_holdout(self, seeds: int) -> JsonObject:
+        """Describe the held-out runs of :meth:`tables_of` for `tuning.json`."""
+        first, holdout = self.config.sweep.first_seed + self.config.sweep.seeds, self.table.holdout
+        return {
+            "excitation": (holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
+            "same_excitation": holdout is None,
+            "seeds": [first, first + seeds - 1],
+        }
+
+    def tables_of(self, config: Config, name: str, held_out_seeds: int | None = None) -> JsonObject:
+        """Return the tables of a stage's study: those of `config` without its axes and evaluation.
+
+        Held-out runs have so many other seeds, and the excitation `tune.holdout` if there is one.
+        """
+        data = config.to_dict()
+        for key in ("notes", "figures", "tune", "uncertainty", "axes"):
+            data.pop(key, None)
+        data["title"] = f"{config.title} ({name})" if config.title else name
+        data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed", "chunk") if key in data["sweep"]}
+        if held_out_seeds is not None:
+            data["sweep"] |= {"seeds": held_out_seeds, "first_seed": config.sweep.first_seed + config.sweep.seeds}
+            if self.table.holdout is not None:
+                data["excitation"] = self.table.holdout.model_dump(by_alias=True, exclude_none=True)
+        return data
 
     def write_manifest(self, **early_results: Any) -> None:
         """Write the manifest, which claims the folder for this study, with results found before the stages."""
-        if self.results is not None and self.folder is not None:
-            make_folder(self.folder)
-            entry = study_head(self._config, self._command) | early_results | {"backend": self._backend}
+        if self.results is not None:
+            make_folder(self.results.path / self.command)
+            entry = study_head(self.config, self.command) | early_results | {"backend": self.backend}
             # files of an earlier call stay until others take their place
-            entry |= {"files": self.manifest.get("files", {}), "folders": [self._command]}
-            self.manifest = self.results.entries[self._command] = entry
+            entry |= {"files": self.manifest.get("files", {}), "folders": [self.command]}
+            self.manifest = self.results.entries[self.command] = entry
             self.results.write_manifest()
 
     def path_of(self, *names: str) -> Path | None:
         """Return a path in the folder, None without a folder."""
-        return None if self.folder is None else self.folder.joinpath(*names)
+        return None if self.results is None else self.results.path.joinpath(self.command, *names)
 
     def read_or_compute(self, name: str, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
         """Read a table from its file, or compute it and store it there. A damaged table is computed anew.
@@ -157,14 +171,14 @@ class Stages:
         Raises:
             InputError: the file is of another study.
         """
-        path, manifest = self.path_of(name), study_head(self._config, self._command)
+        path, manifest = self.path_of(name), study_head(self.config, self.command)
         if path is None:
             return compute()
         with suppress(FileNotFoundError, parts.DamagedFile):
             header, frame = parts.read_part(path)
             if header.study.get("identity") == manifest["identity"]:
                 return frame
-            if not self._overwrite:
+            if not self.overwrite:
                 raise InputError(f"{path}: belongs to another study; choose another folder with --out, or --overwrite")
         frame = compute()
         parts.write_part(path, frame, parts.PartHeader(manifest, {}, "", 0))
@@ -176,17 +190,17 @@ class Stages:
 
         def update(finished: int, _: int) -> None:
             self._finished_lanes = lanes_before + finished
-            if self._progress:
-                self._progress(self._finished_lanes, max(self.total_lanes, self._finished_lanes))
+            if self.progress:
+                self.progress(self._finished_lanes, max(self.total_lanes, self._finished_lanes))
 
         result = sweep(
             study,
             self.path_of(name),
             progress=update,
             devices=self.devices,
-            overwrite=self._overwrite,
-            backend=self._backend,
-            scheduler=self._cluster,
+            overwrite=self.overwrite,
+            backend=self.backend,
+            scheduler=self.cluster,
         )
         self.fallback_reasons |= dict.fromkeys(result.fallback_reasons)
         self.cost = {key: value + result.cost[key] for key, value in self.cost.items()}
@@ -217,4 +231,4 @@ class Stages:
         """
         announce(f"repeating runs ({', '.join(names)})")
         place = self.path_of(*names)
-        return sweep(study, place, progress=self._progress, devices=self.devices, overwrite=True).frame
+        return sweep(study, place, progress=self.progress, devices=self.devices, overwrite=True).frame

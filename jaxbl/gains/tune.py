@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from jaxbl.cluster import Scheduler
-from jaxbl.config import LOOP_OBJECTIVES, Config, ConfigSource, TuneTable, read_config
+from jaxbl.config import LOOP_OBJECTIVES, ConfigSource, TuneTable, read_config
 from jaxbl.errors import InputError
 from jaxbl.observer import AbstractSuperTwisting
 from jaxbl.sweeps.programs import Backend
@@ -93,20 +93,20 @@ def tune(
             f"makes another motion; choose {', '.join(LOOP_OBJECTIVES)}, by which the loop is tuned as a whole"
         )
     config = config.model_copy(update={"tune": table})
-    scenarios = None if table.observers or in_loop else list_scenarios(config, table)
+    scenarios = None if table.observers or in_loop else list_scenarios(config, table.worst_over_uncertainty)
     with open_stages(
         config, "tune", out, scheduler, progress=progress, devices=devices, overwrite=overwrite, backend=backend
     ) as stages:
         if in_loop:
-            return tune_loop(config, table, stages)
+            return tune_loop(stages)
         if scenarios is None:
-            return choose_observer(config, table, stages)
-        return _search_gains(config, table, scenarios, stages)
+            return choose_observer(stages)
+        return _search_gains(scenarios, stages)
 
 
-def _search_gains(config: Config, table: TuneTable, scenarios: Scenarios, stages: Stages) -> Tuning:
-    pilot_before = stages.manifest.get("pilot")
-    search = GainSearch(scenarios, table, pilot_before or run_pilot(scenarios, table), stages)
+def _search_gains(scenarios: Scenarios, stages: Stages) -> Tuning:
+    pilot_before, table = stages.manifest.get("pilot"), stages.table
+    search = GainSearch(scenarios, pilot_before or run_pilot(scenarios, table.holdout), stages)
     if pilot_before is None:
         stages.write_manifest(pilot=search.pilot)
     search.run()
@@ -115,4 +115,4 @@ def _search_gains(config: Config, table: TuneTable, scenarios: Scenarios, stages
     if table.certificate is not None:
         summary["certificates"] = certify_best_gains(search, stages.path_of("certificate.json"))
         summary["passed_over"] = passed_over
-    return Tuning(config, summary, stages.cost, tuple(stages.fallback_reasons), search.candidates)
+    return Tuning(stages.config, summary, stages.cost, tuple(stages.fallback_reasons), search.candidates)

@@ -16,7 +16,6 @@ from jaxbl.sweeps.metrics import SIDE_METRICS
 from .best_gains import NEARLY_AS_GOOD
 from .gain_search import GAIN_METRICS, GainSearch, Window
 from .limits import LEAST_DIFFERENCE, find_limits
-from .stages import describe_holdout
 
 
 def pareto_front(candidates: pd.DataFrame) -> pd.DataFrame:
@@ -29,13 +28,9 @@ class Summary:
     """The summary of a finished search, with runs of the named gains and of the causes of the error."""
 
     def __init__(self, search: GainSearch):
-        self.search, self.table, self.config = search, search.table, search.scenarios.config
+        self.search, self.table = search, search.table
         self.named_rows, self.held_out_rows = (search.compare_gains(held_out=held_out) for held_out in (False, True))
         self.causes = search.split_error()
-        self.best_candidates = {side: search.best_candidate(side) for side in search.sides}
-        self.conditions = {
-            side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in self.best_candidates.items()
-        }
         self.limits = {side: find_limits(search, side) for side in search.sides}
         self.held_out = {
             side: {row["name"]: row for row in self.held_out_rows if row["side"] == side} for side in search.sides
@@ -45,35 +40,37 @@ class Summary:
     def to_dict(self) -> JsonObject:
         """The content of `tuning.json`."""
         search, table, sides = self.search, self.table, self.search.sides
-        first, seeds = self.config.sweep.first_seed, self.config.sweep.seeds
+        config, stages, best = search.scenarios.config, search.stages, search.best_candidates()
+        conditions = {side: judge_gains(row["lambda"], row["alpha"], row["f_plus"]) for side, row in best.items()}
         unit = SIDE_METRICS[f"{table.objective}_rmse"].unit
-        keys = ("lambda", "alpha", "lambda_ratio", "alpha_ratio")
-        return to_jsonable({
-            "title": self.config.title,
-            "objective": table.objective,
+        keys = ["lambda", "alpha", "lambda_ratio", "alpha_ratio"]
+        achieved = [*GAIN_METRICS, "margin_alpha", "margin_exact", "f_plus"]
+        return to_jsonable(stages.describe() | {
             "objective_metric": f"worst {table.objective}_rmse ({unit}) over seeds and scenarios",
-            "seeds": [first, first + seeds - 1],
             "scenarios": search.scenarios.names,
             "f_plus": search.f_plus,
             "pilot": search.pilot,
             "margins": {"exact": table.margin_exact, "alpha": table.margin_alpha},
             "verdict": {side: self._judge_side(side) for side in sides},
-            "gains": {side: {key: self.best_candidates[side][key] for key in keys} for side in sides},
-            "achieved": {side: self._achieved_metrics(side) for side in sides},
+            "gains": {side: {key: row[key] for key in keys} for side, row in best.items()},
+            "achieved": {
+                side: {name: row[name] for name in achieved} | {"peak_ratio": conditions[side]["peak_ratio"]}
+                for side, row in best.items()
+            },
             "limits": self.limits,
-            "conditions": self.conditions,
+            "conditions": conditions,
             "range": _ratio_ranges(search.limits) | {"num": table.num},
             "resolution": {side: {key: ratio - 1.0 for key, ratio in search.cell_ratios(side).items()} for side in sides},
             "stages": [{side: _ratio_ranges(window) for side, window in windows.items()} for windows in search.windows],
             "named": self.named_rows,
-            "holdout": describe_holdout(self.config, table, seeds)
+            "holdout": stages.describe_holdout(config.sweep.seeds)
             | {"f_plus": {side: search.pilot[side]["holdout_f_plus"] for side in sides}}
             | {"rows": self.held_out_rows, "factors": self.factors},
             "pareto": {
                 side: pareto_front(search.candidates[side])[[*keys, "convergence_time", "error"]].to_dict("records")
                 for side in sides
             },
-            "remarks": [*self.config.notes, *self._remarks()],
+            "remarks": [*config.notes, *self._remarks()],
         })  # fmt: skip
 
     def _judge_side(self, side: str) -> JsonObject:
@@ -98,21 +95,14 @@ class Summary:
             "tried": len(candidates),
         }
 
-    def _achieved_metrics(self, side: str) -> JsonObject:
-        names = (name for name in GAIN_METRICS if name != "converged")
-        return {name: self.best_candidates[side][name] for name in names} | {
-            "peak_ratio": self.conditions[side]["peak_ratio"]
-        }
-
     def _compare_with_tuned(self, side: str) -> JsonObject:
         """Divide other gains' metrics by the tuned gains', on the held-out input.
 
         There are no factors for gains that do not always converge.
         """
-        tuned, factors = self.held_out[side]["tuned"], {}
-        for name, row in self.held_out[side].items():
-            if name == "tuned":
-                continue
+        rows, factors = dict(self.held_out[side]), {}
+        tuned = rows.pop("tuned")
+        for name, row in rows.items():
             if row["converged"] < 1.0 or tuned["converged"] < 1.0:
                 laggard, share = min((name, row["converged"]), ("tuned", tuned["converged"]), key=lambda pair: pair[1])
                 factors[name] = {"why_none": f"{laggard}: converged in {100.0 * share:.3g} % of the runs"}
@@ -161,9 +151,7 @@ class Summary:
             )
         candidates = search.candidates[side]
         met = search.constraints_met(candidates)
-        for key in met:
-            if key == "converged":
-                continue
+        for key in search.rooms(candidates):
             others_met = np.logical_and.reduce([is_met for name, is_met in met.items() if name != key])
             missing_alone = candidates[~met[key] & others_met]
             if len(missing_alone) and missing_alone["error"].min() < (1.0 - LEAST_DIFFERENCE) * row["error"]:

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from jaxbl.cluster import Scheduler
-from jaxbl.config import Config, ConfigSource, TuneTable, read_config
+from jaxbl.config import Config, ConfigSource, read_config
 from jaxbl.errors import InputError
 from jaxbl.files import to_jsonable, write_json
 from jaxbl.json_types import JsonObject
@@ -38,6 +38,7 @@ from .error_system import (
 )
 from .loop_gains import GAIN_SECTIONS, LoopRuns
 from .marks import judge_marks
+from .pilot import Scenarios
 from .stages import Stages, open_stages
 
 _MOST_LISTED = 200
@@ -153,7 +154,7 @@ def _find_loop_margins(config: Config, stages: Stages) -> JsonObject:
     """Find the margins of a closed loop in the gains that are on axes (:meth:`.loop_gains.LoopRuns.find_margins`)."""
     if config.controller is None:
         return {}
-    runs = LoopRuns(config, TuneTable(), stages)
+    runs = LoopRuns(Scenarios(config), stages)
     gains = runs.read_study_gains([path for path in config.axis_paths if path.startswith(GAIN_SECTIONS)])
     return runs.find_margins({path: gain for path, gain in gains.items() if gain > 0.0})
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tomli_w
 
-from jaxbl.gains.counterexamples import set_keys
 from jaxbl.gains.loop_gains import LoopTuning
+from jaxbl.gains.stages import set_keys
 from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import find_metric

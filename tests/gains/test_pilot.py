@@ -4,20 +4,18 @@ import numpy as np
 import pytest
 from small_study import rigid_study, small_study
 
-from jaxbl.config import TuneTable, numeric_paths, read_config
+from jaxbl.config import numeric_paths, read_config
 from jaxbl.drive.parameters import leaf_paths
 from jaxbl.gains.pilot import list_scenarios, run_pilot
 from jaxbl.sweeps.trial import run
 
-WORST = TuneTable(worst_over_uncertainty=True)
 
-
-def list_corners(study, table=WORST):
-    return list_scenarios(read_config(study), table)
+def list_corners(study, worst_over_uncertainty=True):
+    return list_scenarios(read_config(study), worst_over_uncertainty)
 
 
 def test_nominal_alone_unless_asked():
-    assert list_corners(small_study(), TuneTable())[1:] == (["nominal"], {})
+    assert list_corners(small_study(), False)[1:] == (("nominal",), {})
 
 
 def test_corners_of_both_sides_at_once():
@@ -39,13 +37,13 @@ def test_what_is_known_exactly_stays():
     assert list(pilot_data.columns) == ["effects.motor.viscous_friction.viscous"]
     assert len(pilot_data.names) == 3
     everything = [f"drive.{side}_{number}" for side in ("motor", "load") for number in ("inertia", "viscous")]
-    assert list_corners(small_study({"uncertainty.exact": everything})).names == ["nominal"]
+    assert list_corners(small_study({"uncertainty.exact": everything})).names == ("nominal",)
 
 
 def test_one_inertia_without_friction():
     pilot_data = list_corners(rigid_study({"drive.motor_viscous": 0.0}))
     assert list(pilot_data.columns) == ["effects.motor.inertia.inertia"]
-    assert pilot_data.names == ["nominal", "inertia -2 %", "inertia +2 %"]
+    assert pilot_data.names == ("nominal", "inertia -2 %", "inertia +2 %")
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -63,7 +61,7 @@ def test_pilot_agrees_with_the_trace_of_a_run():
     study = small_study(
         {"observer.motor.velocity_error": 0.0, "observer.load.velocity_error": 0.3, "excitation.amplitude": 0.5}
     )
-    pilot_data = run_pilot(list_corners(study, TuneTable()), TuneTable())
+    pilot_data = run_pilot(list_corners(study, False))
     trace, drive = run(study).trace, {"motor": (0.05, 0.15), "load": (7.0, 16.0)}
     for side, (inertia, viscous) in drive.items():
         driving = trace["u"] if side == "motor" else 0.0
@@ -82,6 +80,6 @@ def test_pilot_agrees_with_the_trace_of_a_run():
 
 def test_pilot_takes_the_worst_drive():
     study = small_study({"uncertainty.relative": 0.3, "excitation.amplitude": 0.5})
-    nominal, worst = (run_pilot(list_corners(study, table), table) for table in (TuneTable(), WORST))
+    nominal, worst = (run_pilot(list_corners(study, worst)) for worst in (False, True))
     for side in ("motor", "load"):
         assert worst[side]["f_plus"] > nominal[side]["f_plus"]
