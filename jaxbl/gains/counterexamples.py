@@ -19,7 +19,7 @@ _MOST_REPEATED = 4096
 
 def run_columns(config: Config) -> list[str]:
     """Return the columns that tell runs of a study apart."""
-    return [*(axis.path for axis in config.axes), "seed"]
+    return [*config.axis_paths, "seed"]
 
 
 def add_causes(counterexamples: pd.DataFrame, study: Config, level: str, side: str, stages: Stages) -> pd.DataFrame:
@@ -34,11 +34,8 @@ def add_causes(counterexamples: pd.DataFrame, study: Config, level: str, side: s
     cause = cause.where(~is_excused, "f_plus underestimated")
     keys = run_columns(study)
     lead = ["level", "side", "condition", "bound", "cause", *keys]
-    return (
-        counterexamples.assign(cause=cause)
-        .drop(columns="row")[[*lead, *(c for c in counterexamples.columns if c not in (*lead, "row"))]]
-        .sort_values(["condition", "bound", *keys], ignore_index=True)
-    )
+    columns = [*lead, *counterexamples.columns.difference(["row", *lead], sort=False)]
+    return counterexamples.assign(cause=cause)[columns].sort_values(["condition", "bound", *keys], ignore_index=True)
 
 
 def _list_remedies(run: JsonObject, level: str) -> dict[str, JsonObject]:
@@ -63,51 +60,53 @@ def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stage
     """
     repeated_rows = rows.iloc[np.unique(np.linspace(0, len(rows) - 1, _MOST_REPEATED).astype(int))]
     structural = list(Points(study).groups[0].structural)
+    paths = [path for path in study.axis_paths if path not in structural]
     causes = pd.Series("not tried", index=rows.index, dtype=object)
     groups = repeated_rows.groupby(structural, sort=False) if structural else [((), repeated_rows)]
     for number, (_, group) in enumerate(groups):
         name = f"{level}-{side}-{number}"
-        structural_values = {path: group[path].iloc[0] for path in structural}
-        remedies = _list_remedies(set_keys(study.to_dict(), structural_values)["run"], level)
-        all_remedies = {path: value for remedy in remedies.values() for path, value in remedy.items()}
+        tables = set_keys(study.to_dict(), {path: group[path].iloc[0] for path in structural})
+        remedies = _list_remedies(tables["run"], level)
         helps = {}
         for cause, remedy in remedies.items():
-            frame = repeat_runs(study, group, structural_values, remedy, stages, f"{name}-{cause}")
+            frame = repeat_runs(tables, paths, group, remedy, stages, f"{name}-{cause}")
             if frame is not None:
                 helps[cause] = frame[f"{side}.converged"].to_numpy(bool)
-        group_causes = pd.Series(
-            [" or ".join(cause for cause in helps if helps[cause][i]) for i in range(len(group))],
-            index=group.index,
-            dtype=object,
-        )
-        failing = group[group_causes == ""]
-        frame = None
-        if len(failing):
-            frame = repeat_runs(study, failing, structural_values, all_remedies, stages, f"{name}-several")
-        if frame is not None:
-            # a failing observer can lower its own f_plus; once it works, alpha turns out to be too small
-            other_causes = np.where(frame[f"{side}.margin_alpha"] <= 1.0, "f_plus underestimated", "unexplained")
-            group_causes[failing.index] = np.where(frame[f"{side}.converged"].to_numpy(bool), "several", other_causes)
-        causes[group.index] = group_causes
+        causes[group.index] = [" or ".join(cause for cause in helps if helps[cause][i]) for i in range(len(group))]
+        failing = group[causes[group.index] == ""]
+        if not len(failing):
+            continue
+        all_remedies = {path: value for remedy in remedies.values() for path, value in remedy.items()}
+        frame = repeat_runs(tables, paths, failing, all_remedies, stages, f"{name}-several")
+        assert frame is not None, "a longer run has an effect"
+        # a failing observer can lower its own f_plus; once it works, alpha turns out to be too small
+        other_causes = np.where(frame[f"{side}.margin_alpha"] <= 1.0, "f_plus underestimated", "unexplained")
+        causes[failing.index] = np.where(frame[f"{side}.converged"].to_numpy(bool), "several", other_causes)
     return causes
 
 
 def repeat_runs(
-    study: Config, rows: pd.DataFrame, structural_values: JsonObject, change: JsonObject, stages: Stages, name: str
+    tables: JsonObject, paths: list[str], rows: pd.DataFrame, change: JsonObject, stages: Stages, name: str
 ) -> pd.DataFrame | None:
-    """Repeat runs with changed keys, as a study of listed points. Returns None if the change has no effect."""
-    unchanged = set_keys(study.to_dict(), structural_values)
-    data = set_keys(unchanged, change)
-    paths = [axis.path for axis in study.axes if axis.path not in structural_values and axis.path not in change]
-    removed_axes = [axis.path for axis in study.axes if axis.path in change and axis.path not in structural_values]
-    before, after = (read_config({**tables, "axes": []}).to_dict() for tables in (unchanged, data))
-    if not removed_axes and before == after:
+    """Repeat runs with changed keys, as a study of listed points. Returns None if the change has no effect.
+
+    Args:
+        tables: the study's.
+        paths: axes whose values `rows` has; those that the change sets are left out.
+        rows: the runs.
+        change: values by path, as of :func:`set_keys`.
+        stages: runs the study.
+        name: of the study, in the folder of the causes.
+    """
+    data, unchanged_paths = set_keys(tables, change), [path for path in paths if path not in change]
+    before, after = (read_config(study | {"axes": []}).to_dict() for study in (tables, data))
+    if unchanged_paths == paths and before == after:
         return None
-    points = rows[paths].drop_duplicates()
-    data["axes"] = list_axes({"runs": {path: points[path].tolist() for path in paths}})
+    points = rows[unchanged_paths].drop_duplicates()
+    data["axes"] = list_axes({"runs": points.to_dict("list")})
     data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed")}
     frame = stages.rerun(read_config(data), "causes", name.replace(" ", "_"))
-    labels, wanted_labels = (pd.MultiIndex.from_frame(runs[[*paths, "seed"]]) for runs in (frame, rows))
+    labels, wanted_labels = (pd.MultiIndex.from_frame(runs[[*unchanged_paths, "seed"]]) for runs in (frame, rows))
     positions = labels.get_indexer(wanted_labels)
     assert (positions >= 0).all(), "a run was not repeated"
     return frame.iloc[positions]

@@ -2,7 +2,6 @@
 and the least lambda of each gain condition."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
@@ -64,9 +63,9 @@ def _least_lambda(alpha: Any, damping: Any) -> Any:
     return least_lambda_simulated(alpha, jnp.ones_like(alpha), damping=damping)
 
 
-def simulate_error_system(config: Config, stages: Stages) -> ErrorSystemMap:
+def simulate_error_system(stages: Stages) -> ErrorSystemMap:
     """Simulate the error system over the plane, or read it from the folder."""
-    settings = config.verify
+    settings = stages.config.verify
     alpha, lambda_ = settings.alpha_ratio.values(), settings.lambda_ratio.values()
     cells = [c.ravel() for c in np.meshgrid(lambda_, alpha, indexing="ij")]
     shape = (len(lambda_), len(alpha))
@@ -90,7 +89,9 @@ def simulate_error_system(config: Config, stages: Stages) -> ErrorSystemMap:
     return ErrorSystemMap(alpha, lambda_, ratio, closed_form, boundaries.pop(0.0), boundaries)
 
 
+@cache
 def _conditions_with_q(q: float | None) -> dict[str, Condition]:
+    """Cached, as compiled programs are by the function."""
     if q is None:
         return CONDITIONS
     return CONDITIONS | {
@@ -103,19 +104,13 @@ def list_conditions(config: Config) -> dict[str, Condition]:
     return _conditions_with_q(config.verify.q)
 
 
-@cache
-def _compile_demands(q: float | None) -> Callable[..., Any]:
-    conditions = _conditions_with_q(q)
-    return jax.jit(
-        lambda alpha, f_plus: {name: condition.least_lambda(alpha, f_plus) for name, condition in conditions.items()}
-    )
-
-
 def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> NamedArrays:
     """Return each condition's least lambda (rad^0.5/s) at alpha and f_plus (rad/s^2), with the study's q in (32)."""
     with jax.enable_x64(True):
-        demands = apply_elementwise(_compile_demands(config.verify.q), [np.asarray(alpha, float), np.asarray(f_plus, float)])
-    return {name: demands[name] for name in list_conditions(config)}
+        return {
+            name: apply_elementwise(condition.least_lambda, [alpha, f_plus])
+            for name, condition in list_conditions(config).items()
+        }
 
 
 def count_judgements(config: Config, name: str, holds: np.ndarray, converged: np.ndarray) -> JsonObject:
@@ -129,15 +124,19 @@ def count_judgements(config: Config, name: str, holds: np.ndarray, converged: np
     }
 
 
+def summarise_ratios(ratios: np.ndarray, at_least: int = 0) -> JsonObject:
+    """Summarise the ratios of demanded lambda to the least that works; in `at_least` columns the true one is larger."""
+    columns = pd.Series(ratios)
+    return {"median": columns.median(), "max": columns.max(), "columns": len(columns), "at_least": at_least}
+
+
 def judge_error_system(config: Config, error_map: ErrorSystemMap) -> JsonObject:
     """Count the cells of the plane by condition: a level of `verdict.json`."""
     converged = error_map.ratio < 1.0
     conditions = []
     for name, demanded in demanded_lambda(config, error_map.alpha, np.ones_like(error_map.alpha)).items():
-        ratios = demanded / error_map.boundary
-        conservatism = {"median": np.median(ratios), "max": ratios.max(), "columns": len(ratios), "at_least": 0}
-        holds = error_map.lambda_[:, None] > demanded
-        conditions.append(count_judgements(config, name, holds, converged) | {"conservatism": conservatism})
+        judgement = count_judgements(config, name, error_map.lambda_[:, None] > demanded, converged)
+        conditions.append(judgement | {"conservatism": summarise_ratios(demanded / error_map.boundary)})
     return {
         "level": "normalised",
         "cells": error_map.ratio.size,

@@ -35,6 +35,7 @@ from .error_system import (
     demanded_lambda,
     judge_error_system,
     simulate_error_system,
+    summarise_ratios,
 )
 from .loop_gains import GAIN_SECTIONS, LoopRuns
 from .marks import judge_marks
@@ -94,14 +95,15 @@ def verify(
     with open_stages(
         config, "verify", out, scheduler, progress=progress, devices=devices, overwrite=overwrite, backend=backend
     ) as stages:
-        return _verify_levels(config, sides, stages)
+        return _verify_levels(sides, stages)
 
 
-def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
+def _verify_levels(sides: list[str], stages: Stages) -> Verdict:
     stages.write_manifest()
-    studies = {"drive": _idealise_study(config), "sampled": _strip_study(config)}
+    config = stages.config
+    studies = {"drive": _idealise_study(config.to_dict()), "sampled": _strip_study(config.to_dict())}
     stages.total_lanes = sum(len(Points(study)) * study.sweep.seeds for study in studies.values())
-    error_map = simulate_error_system(config, stages)
+    error_map = simulate_error_system(stages)
     levels = {}
     for level, study in studies.items():
         levels[level] = frame = stages.run(study, level).frame
@@ -113,10 +115,9 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
     for level, frame in levels.items():
         for side in sides:
             summary, counterexamples = _judge_level(config, level, side, frame)
-            if len(counterexamples):
-                counterexamples = add_causes(counterexamples, studies[level], level, side, stages)
-                runs = counterexamples.drop_duplicates(["bound", *run_columns(studies[level])])
-                summary["causes"] = {bound: part.cause.value_counts().to_dict() for bound, part in runs.groupby("bound")}
+            counterexamples = add_causes(counterexamples, studies[level], level, side, stages)
+            runs = counterexamples.drop_duplicates(["bound", *run_columns(studies[level])])
+            summary["causes"] = {bound: part.cause.value_counts().to_dict() for bound, part in runs.groupby("bound")}
             if level == "drive":
                 summary["below_f_plus"] = summarise_converged_below(studies[level], side, frame)
             summaries.append(summary)
@@ -138,7 +139,7 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
                 for damping, boundary in error_map.boundary_by_damping.items()
             ],
             "marks": judge_marks(config, studies["drive"], stages),
-            "loop_margins": _find_loop_margins(config, stages),
+            "loop_margins": _find_loop_margins(stages),
             "counterexamples": at_true_bound.head(_MOST_LISTED).to_dict("records"),
             "counterexamples_in_all": len(at_true_bound),
         }
@@ -150,8 +151,9 @@ def _verify_levels(config: Config, sides: list[str], stages: Stages) -> Verdict:
     return Verdict(config, summary, error_map, levels, counterexamples, tuple(stages.fallback_reasons))
 
 
-def _find_loop_margins(config: Config, stages: Stages) -> JsonObject:
+def _find_loop_margins(stages: Stages) -> JsonObject:
     """Find the margins of a closed loop in the gains that are on axes (:meth:`.loop_gains.LoopRuns.find_margins`)."""
+    config = stages.config
     if config.controller is None:
         return {}
     runs = LoopRuns(Scenarios(config), stages)
@@ -165,8 +167,9 @@ def sides_with_gain_axes(config: Config) -> list[str]:
     Raises:
         InputError: there is none, or the axes are no grid that `verify` can search.
     """
-    paths = {axis.path for axis in config.axes}
-    sides = [side for side in config.sides if {f"observer.{side}.alpha", f"observer.{side}.lambda"} <= paths]
+    sides = [
+        side for side in config.sides if {f"observer.{side}.alpha", f"observer.{side}.lambda"} <= set(config.axis_paths)
+    ]
     if not sides:
         raise InputError(
             "axes: verify needs axes over both gains of an observer, such as observer.motor.alpha and observer.motor.lambda"
@@ -183,29 +186,26 @@ def sides_with_gain_axes(config: Config) -> list[str]:
     return sides
 
 
-def _strip_study(config: Config, **updates: Any) -> Config:
-    """Return the study with tables replaced, and without those on which its runs do not depend."""
-    data = config.to_dict()
-    for key in ("figures", "verify"):
-        data.pop(key, None)
-    data |= updates
+def _strip_study(data: JsonObject) -> Config:
+    """Return the study of these tables without those on which its runs do not depend."""
+    data = {key: table for key, table in data.items() if key not in ("figures", "verify")}
     # the verdict needs metrics of its own
     data["sweep"].pop("metrics", None)
     return read_config(data)
 
 
-def _idealise_study(config: Config) -> Config:
-    """Return the study with ideal encoders and the implicit observer, at one seed."""
-    observer = config.to_dict()["observer"] | {"discretisation": "implicit"}
+def _idealise_study(data: JsonObject) -> Config:
+    """Return the study of these tables with ideal encoders and the implicit observer, at one seed."""
     ignored_paths = ("encoders.", "observer.discretisation", "run.sample_period", "run.substeps")
-    axes = [axis.model_dump(exclude_none=True) for axis in config.axes if not axis.path.startswith(ignored_paths)]
+    axes = [axis for axis in data["axes"] if not axis["path"].startswith(ignored_paths)]
     labels = [axis.get("zip") for axis in axes]
     for axis in axes:
         if "zip" in axis and labels.count(axis["zip"]) == 1:
             del axis["zip"]
             if "values" in axis:
                 axis["values"] = list(dict.fromkeys(axis["values"]))
-    return _strip_study(config, encoders={}, observer=observer, axes=axes, sweep=config.to_dict()["sweep"] | {"seeds": 1})
+    observer, sweep = data["observer"] | {"discretisation": "implicit"}, data["sweep"] | {"seeds": 1}
+    return _strip_study(data | {"encoders": {}, "observer": observer, "axes": axes, "sweep": sweep})
 
 
 def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> tuple[JsonObject, pd.DataFrame]:
@@ -219,38 +219,32 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
     bounds = {"true": f"{side}.f_plus", "claimed": f"{side}.f_plus_acceleration"}
     # the least lambda that converged, everything else being equal
     other_columns = [key for key in run_columns(config) if key != path and key in frame]
-    least_rows = frame[converged].groupby(other_columns, sort=False)[path].idxmin().to_numpy()
-    position = frame.index.get_indexer(least_rows)
-    smallest = lambda_.min()
-    summaries: dict[str, list[JsonObject]] = {}
+    least = frame[converged].groupby(other_columns, sort=False)[path].idxmin().to_numpy()
+    summaries: dict[str, list[JsonObject]] = {bound: [] for bound in bounds}
     counterexamples = []
     for bound, column in bounds.items():
-        summaries[bound] = []
         for name, demanded in demanded_lambda(config, alpha, frame[column].to_numpy(float)).items():
             holds = lambda_ > demanded
-            is_counterexample = holds & ~converged
-            with np.errstate(divide="ignore"):
-                ratios = demanded[position] / lambda_[position]
-            demands_more = np.isfinite(ratios) & (ratios > 1.0)
             judgement = count_judgements(config, name, holds, converged)
             if bound == "true":
-                columns = pd.Series(ratios[demands_more])
+                with np.errstate(divide="ignore"):
+                    ratios = demanded[least] / lambda_[least]
+                demands_more = np.isfinite(ratios) & (ratios > 1.0)
                 # where the least lambda of the grid converged, the true ratio is larger
-                at_least = int((demands_more & (lambda_[position] <= smallest)).sum())
-                judgement["conservatism"] = {"median": columns.median(), "max": columns.max(), "columns": len(columns)}
-                judgement["conservatism"]["at_least"] = at_least
+                at_least = demands_more & (lambda_[least] <= lambda_.min())
+                judgement["conservatism"] = summarise_ratios(ratios[demands_more], int(at_least.sum()))
             summaries[bound].append(judgement)
-            if is_counterexample.any():
-                extra = {"level": level, "side": side, "condition": name, "bound": bound}
-                counterexamples.append(frame[is_counterexample].assign(row=np.flatnonzero(is_counterexample), **extra))
+            rows = np.flatnonzero(holds & ~converged)
+            extra = {"level": level, "side": side, "condition": name, "bound": bound}
+            counterexamples.append(frame.iloc[rows].assign(row=rows, **extra))
     converged_runs = frame[converged]
     true_bound, claimed_bound = (converged_runs[column] for column in bounds.values())
     too_small = true_bound > claimed_bound
-    ratio = pd.Series(true_bound / claimed_bound).replace([np.inf, -np.inf], np.nan).dropna()
+    ratio = (true_bound / claimed_bound).replace([np.inf, -np.inf], np.nan)
     claimed = {
         "definition": "twice the largest acceleration",
         "converged_runs": len(converged_runs),
-        "too_small": float(too_small.mean()) if len(converged_runs) else None,
+        "too_small": too_small.mean(),
         "true_over_claimed": {"median": ratio.median(), "max": ratio.max()},
         "by_input": _summarise_by_input(config, converged_runs.assign(too_small=too_small), bounds),
         "conditions": summaries["claimed"],
@@ -259,13 +253,11 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
         "level": level,
         "side": side,
         "cells": len(frame),
-        "converged": int(converged.sum()),
+        "converged": len(converged_runs),
         "diverged": int((~frame["finite"].astype(bool)).sum()),
         "conditions": summaries["true"],
         "claimed_bound": claimed,
     }
-    if not counterexamples:
-        return summary, pd.DataFrame({"bound": [], "row": []})
     return summary, pd.concat(counterexamples, ignore_index=True)
 
 

@@ -370,7 +370,8 @@ def test_a_long_period_is_the_cause_and_a_quarter_of_the_runs_own_mends_it(verif
 def test_runs_repeated_for_their_cause_keep_their_noise():
     study = read_config(rigid_study(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
     frame = sweep(study).frame
-    rows = repeat_runs(study, frame.iloc[[1, 5]], {}, {"run.substeps": 2}, Stages(study, "verify"), "again")
+    change, stages = {"run.substeps": 2}, Stages(study, "verify")
+    rows = repeat_runs(study.to_dict(), study.axis_paths, frame.iloc[[1, 5]], change, stages, "again")
     keys = [LAMBDA, ALPHA, "seed"]
     pd.testing.assert_frame_equal(rows[keys].reset_index(drop=True), frame.iloc[[1, 5]][keys].reset_index(drop=True))
     assert set(rows["seed"]) <= {5, 6}
