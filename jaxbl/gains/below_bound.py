@@ -15,31 +15,21 @@ from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.elementwise import call_in_float64
 from jaxbl.sweeps.trial import run
 
-from .under_tuned import excursion, simulate_error
+from .under_tuned import Disturbance, excursion, simulate_error
 
 _MOST_INPUTS = 32
 """Combinations of inputs and plants, evenly spread, that are run once more for their disturbance."""
 
 
-def missing_acceleration(drive: Any, side: str, trace: pd.DataFrame) -> np.ndarray:
-    """Return the acceleration (rad/s^2) that the nominal model lacks at the true velocity, at the samples of a trace.
+def read_disturbance(drive: Any, side: str, trace: pd.DataFrame) -> Disturbance:
+    """Return what disturbs the error of a side along a trace: the acceleration that the nominal model lacks.
 
-    It does not depend on the observer: f_plus contains the observer's velocity error as well.
+    It is taken at the true velocity, and does not depend on the observer: f_plus contains the observer's velocity error as
+    well.
     """
-    velocity, torque = (trace[name].to_numpy() for name in (f"{side}.velocity", "u"))
-    return trace[f"{side}.acceleration"].to_numpy() - call_in_float64(partial(drive.acceleration, side), velocity, torque)
-
-
-def read_disturbance(drive: Any, side: str, trace: pd.DataFrame) -> dict[str, Any]:
-    """Return what disturbs the error of a side along a trace, as arguments of :func:`.under_tuned.simulate_error`."""
-    friction_rate = float(drive.viscous(side)) / float(drive.inertia(side))
-    missing = missing_acceleration(drive, side, trace)
-    return {"times": trace["t"].to_numpy(), "disturbance": missing, "damping": friction_rate}
-
-
-def share_of_time_above(alpha: float, disturbance: np.ndarray) -> float:
-    """Return the share of the time in which an evenly sampled disturbance (rad/s^2) exceeds alpha."""
-    return float(np.mean(np.abs(disturbance) > alpha))
+    velocity, torque, acceleration = (trace[name].to_numpy() for name in (f"{side}.velocity", "u", f"{side}.acceleration"))
+    missing = acceleration - call_in_float64(partial(drive.acceleration, side), velocity, torque)
+    return Disturbance(trace["t"].to_numpy(), missing, float(drive.viscous(side)) / float(drive.inertia(side)))
 
 
 def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> JsonObject | None:
@@ -52,7 +42,7 @@ def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> 
     runs_below = frame[frame[f"{side}.converged"].astype(bool) & (frame[f"{side}.margin_alpha"] <= 1.0)]
     if not len(runs_below):
         return None
-    paths = [axis.path for axis in study.axes]
+    paths = study.axis_paths
     inputs = [path for path in paths if not path.startswith(("observer.", "equivalent_control.", "identifier."))]
     groups = [group for _, group in runs_below.groupby(inputs, sort=True)] if inputs else [runs_below]
     rows = []
@@ -61,23 +51,17 @@ def summarise_converged_below(study: Config, side: str, frame: pd.DataFrame) -> 
         config = with_values(study, {path: group[path].iloc[0] for path in inputs})
         disturbance = read_disturbance(config.build().drive, side, run(config, backend="scan").trace)
         for alpha, runs in group.groupby(f"observer.{side}.alpha"):
-            share = share_of_time_above(float(alpha), disturbance["disturbance"])
-            rows.append((excursion(float(alpha), **disturbance), share, runs, disturbance))
+            rows.append((excursion(float(alpha), disturbance), disturbance.share_above(alpha), runs, disturbance))
     predicted, _, runs, disturbance = max(rows, key=lambda row: row[0])
     # the least lambda damps the error least
     worst_run = runs.loc[runs[f"observer.{side}.lambda"].idxmin()]
-    error_path = simulate_error(
-        float(worst_run[f"observer.{side}.lambda"]),
-        float(worst_run[f"observer.{side}.alpha"]),
-        **disturbance,
-        velocity_error=0.0,
-    )
+    lambda_, alpha = (float(worst_run[f"observer.{side}.{gain}"]) for gain in ("lambda", "alpha"))
     return {
         "converged_runs": len(runs_below),
         "runs": sum(len(row[2]) for row in rows),
         "disturbance_exceeds": sum(len(row[2]) for row in rows if row[1] > 0.0),
         "share_above_alpha": max(row[1] for row in rows),
         "excursion_predicted": predicted,
-        "excursion_simulated": error_path.largest,
+        "excursion_simulated": simulate_error(lambda_, alpha, disturbance, velocity_error=0.0).largest,
         "at": {path: worst_run[path] for path in paths},
     }

@@ -8,59 +8,46 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
 from jaxbl.config import Config, read_config
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, bisect, peak_ratio
+from jaxbl.sweeps.elementwise import call_in_float64
 from jaxbl.sweeps.trial import run
 
-from .below_bound import read_disturbance, share_of_time_above
+from .below_bound import read_disturbance
 from .pilot import list_axes
 from .stages import Stages
-from .under_tuned import (
-    excursion,
-    least_cycle_frequency,
-    least_cycle_frequency_simulated,
-    peak_law,
-    simulate_error,
-    sine_cycle,
-    sine_cycle_simulated,
-)
+from .under_tuned import Disturbance, SineError, excursion, peak_law, simulate_error
 from .worst_case import half_cycle
 
 
-def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[JsonObject]:
+def judge_marks(ideal: Config, stages: Stages) -> list[JsonObject]:
     """Judge the marked gains (`marks` of `verdict.json`): their bounds, margins and peak ratios.
 
     `ideal` is the study with ideal encoders.
     """
-    judged = []
-    base = ideal.to_dict()
+    judged, config = [], stages.config
+    base = ideal.to_dict() | {"axes": [], "sweep": {}}
     drive = config.build().drive
-    # the observer does not act on the drive: one run has the disturbance of all gains
-    trace = run(read_config(base | {"axes": [], "sweep": {}})).trace if config.verify.marks else None
-    for side in ("motor", "load"):
+    for side in config.sides:
         marks = [mark for mark in config.verify.marks if mark.side == side]
         if not marks:
             continue
-        assert trace is not None
         pairs = [(mark.lambda_, mark.alpha) for mark in marks]
-        points = list(dict.fromkeys(pairs))
-        columns = {
-            f"observer.{side}.{name}": list(gains)
-            for name, gains in zip(("lambda", "alpha"), zip(*points, strict=True), strict=True)
-        }
-        frame = stages.rerun(base | {"axes": list_axes({"marks": columns}), "sweep": {}}, "marks", side)
+        gains = pd.DataFrame(pairs, columns=[f"observer.{side}.{gain}" for gain in ("lambda", "alpha")])
+        axes = list_axes({"marks": gains.drop_duplicates().to_dict("list")})
+        runs = gains.merge(stages.rerun(base | {"axes": axes}, "marks", side), how="left").to_dict("records")
+        # the observer does not act on the drive: one run has the disturbance of all gains
+        disturbance = read_disturbance(drive, side, run(read_config(base)).trace)
         starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
-        error, disturbance = abs(starts[1]), read_disturbance(drive, side, trace)
-        friction = disturbance["damping"]
-        for mark, pair in zip(marks, pairs, strict=True):
-            metrics = frame.iloc[points.index(pair)]
+        error, friction = abs(starts[1]), disturbance.damping
+        for mark, pair, metrics in zip(marks, pairs, runs, strict=True):
             bound = np.float64(metrics[f"{side}.f_plus"])
-            with jax.enable_x64(True):
-                ratios = _peak_ratios(*map(np.float64, (*pair, bound, friction, error)))
+            ratios = call_in_float64(_peak_ratios, *pair, bound, friction, error)
             explanation = None
-            if float(ratios["peak_ratio"]) >= 1.0 and mark.alpha != 0.0 and np.isfinite(disturbance["disturbance"]).all():
+            if float(ratios["peak_ratio"]) >= 1.0 and mark.alpha != 0.0 and np.isfinite(disturbance.values).all():
                 explanation = _explain_convergence(*pair, disturbance, starts)
             judged.append(
                 {
@@ -73,9 +60,9 @@ def judge_marks(config: Config, ideal: Config, stages: Stages) -> list[JsonObjec
                     "lambda_ratio": mark.lambda_ / np.sqrt(bound),
                     "velocity_error": error,
                     "damping": friction * error / bound,
-                    **{name: float(ratio) for name, ratio in ratios.items()},
+                    **ratios,
                     **{f"margin_{name}": metrics[f"{side}.margin_{name}"] for name in CONDITIONS},
-                    "converged": bool(metrics[f"{side}.converged"]),
+                    "converged": metrics[f"{side}.converged"],
                     "convergence_time": metrics[f"{side}.convergence_time"],
                     "on_this_disturbance": explanation,
                 }
@@ -87,26 +74,23 @@ _FALLEN_SHARE = 0.1
 """The time at which peaks have fallen to this share of the first one is reported."""
 
 
-def _explain_convergence(
-    lambda_: float, alpha: float, error_inputs: dict[str, Any], starts: tuple[float, ...]
-) -> JsonObject:
-    """Explain how gains that miss the exact condition behave under a disturbance (:func:`.below_bound.read_disturbance`).
+def _explain_convergence(lambda_: float, alpha: float, disturbance: Disturbance, starts: tuple[float, ...]) -> JsonObject:
+    """Explain how gains that miss the exact condition behave under a disturbance.
 
     The numbers are predicted by :mod:`.under_tuned`, and simulated in continuous time. `starts` are the position error (rad)
     and the velocity error (rad/s) at t = 0.
     """
-    (position, velocity), (times, disturbance, friction) = starts, error_inputs.values()
-    largest = float(np.abs(disturbance).max())
-    share = share_of_time_above(alpha, disturbance)
+    (position, velocity), (times, values, friction) = starts, disturbance
+    largest, share = float(np.abs(values).max()), disturbance.share_above(alpha)
     explanation: JsonObject = {"largest_disturbance": largest, "share_above_alpha": share}
     if share > 0.0:
-        explanation["excursion_predicted"] = excursion(alpha, **error_inputs)
-        explanation["excursion_simulated"] = simulate_error(lambda_, alpha, **error_inputs, velocity_error=0.0).largest
+        explanation["excursion_predicted"] = excursion(alpha, disturbance)
+        explanation["excursion_simulated"] = simulate_error(lambda_, alpha, disturbance, velocity_error=0.0).largest
     elif any(starts):
         # the velocity error at the first zero of the position error, without losses
-        peak = float(np.sqrt(velocity**2 + 2.0 * (alpha - disturbance[0] * np.sign(position)) * abs(position)))
-        predicted_peaks = peak_law(lambda_, alpha, **error_inputs, peak=peak)
-        path = simulate_error(lambda_, alpha, **error_inputs, position_error=position, velocity_error=velocity)
+        peak = float(np.sqrt(velocity**2 + 2.0 * (alpha - values[0] * np.sign(position)) * abs(position)))
+        predicted_peaks = peak_law(lambda_, alpha, disturbance, peak)
+        path = simulate_error(lambda_, alpha, disturbance, position_error=position, velocity_error=velocity)
         # an error may end without another passage
         simulated_peaks = np.r_[times[0], path.times, path.end_time], np.r_[path.largest, path.peaks, 0.0]
         for name, peak_times, peaks in (("predicted", times, predicted_peaks), ("simulated", *simulated_peaks)):
@@ -114,16 +98,14 @@ def _explain_convergence(
             index = np.flatnonzero(peaks > _FALLEN_SHARE * peak)[-1] + 1
             # inf or None: peaks are larger at the end of the run
             explanation[f"tenth_{name}"] = float(peak_times[index]) if index < len(peak_times) else None
-    least = least_cycle_frequency(lambda_, alpha, largest, friction)
-    cycle: JsonObject = {"least_predicted": least, "least_simulated": None}
+    sine = SineError(lambda_, alpha, largest, friction)
+    least = sine.predict_least_frequency()
+    cycle: JsonObject = {"least_predicted": least, "least_simulated": sine.simulate_least_frequency()}
     if 0.0 < least < np.inf:
         # far enough above the least frequency
-        frequency = 2.0 * least
-        predicted = sine_cycle(lambda_, alpha, largest, frequency, friction)
-        simulated = sine_cycle_simulated(lambda_, alpha, largest, frequency, friction)
-        cycle["least_simulated"] = least_cycle_frequency_simulated(lambda_, alpha, largest, friction)
-        cycle |= {"frequency": frequency, "predicted": predicted and predicted._asdict()}
-        cycle |= {"simulated": simulated and simulated._asdict()}
+        cycle["frequency"] = frequency = 2.0 * least
+        for name, found in (("predicted", sine.predict_cycle(frequency)), ("simulated", sine.simulate_cycle(frequency))):
+            cycle[name] = found and found._asdict()
     return explanation | {"sine_cycle": cycle}
 
 

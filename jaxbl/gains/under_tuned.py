@@ -6,7 +6,7 @@ the losses of a half cycle (lambda, damping) and, for :func:`peak_law`, in the c
 (docs/theory_appendix.md), and checked against :func:`simulate_error`, which takes no such approximation.
 """
 
-from bisect import bisect_right
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -25,9 +25,22 @@ _STARTING_SHARE = 1e-3
 """Share of a pulse's final speed from which on a zero error is simulated."""
 
 
-def peak_law(
-    lambda_: float, alpha: float, times: np.ndarray, disturbance: np.ndarray, *, damping: float, peak: float
-) -> np.ndarray:
+class Disturbance(NamedTuple):
+    """What acts on the error: d (rad/s^2) at evenly spaced times (s), linear between them, and damping of x2 (1/s).
+
+    The arrays have one shape (n,).
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    damping: float = 0.0
+
+    def share_above(self, alpha: float) -> float:
+        """Return the share of the time in which |d| exceeds alpha."""
+        return float(np.mean(np.abs(self.values) > alpha))
+
+
+def peak_law(lambda_: float, alpha: float, disturbance: Disturbance, peak: float) -> np.ndarray:
     """Return the peaks of the error over time under a slow disturbance below alpha.
 
     Without losses a cycle keeps its area V^3 / (alpha^2 - d^2), so that peaks V follow the disturbance and come back with
@@ -39,16 +52,15 @@ def peak_law(
     Args:
         lambda_: gain, rad^0.5/s.
         alpha: gain, rad/s^2.
-        times: s, shape (n,).
-        disturbance: rad/s^2, shape (n,).
-        damping: viscous damping of x2, 1/s.
+        disturbance: what acts on the error.
         peak: peak at the first of the times, rad/s.
 
     Returns:
         Peaks, rad/s, shape (n,).
     """
     # at |d| = alpha itself there is no half cycle; beside it there is one
-    above, below = (np.maximum(alpha + sign * disturbance, 1e-9 * alpha) for sign in (1.0, -1.0))
+    times, values, damping = disturbance
+    above, below = (np.maximum(alpha + sign * values, 1e-9 * alpha) for sign in (1.0, -1.0))
     room = above * below
     roots = 1.0 / np.sqrt(2.0 * above) + 1.0 / np.sqrt(2.0 * below)
     rate = 0.125 * np.pi * lambda_ * roots * room / alpha
@@ -58,31 +70,24 @@ def peak_law(
     return shape * decay * np.maximum(peak / shape[0] - lost, 0.0)
 
 
-def excursion(alpha: float, times: np.ndarray, disturbance: np.ndarray, damping: float) -> float:
+def excursion(alpha: float, disturbance: Disturbance) -> float:
     """Return the largest |x2| (rad/s) that pulses of |d| above alpha cause from a zero error; this is exact.
 
     x1 keeps the sign of d as long as x2 does, so that x2' = |d| - alpha - damping x2 from the beginning of a pulse. Without
     damping x2 is the integral of |d| - alpha over the pulse.
     """
+    times, values, damping = disturbance
     steps = np.diff(times)
-    remaining_share = np.exp(-damping * steps)
     effective_steps = steps if damping == 0.0 else -np.expm1(-damping * steps) / damping
-    above = np.abs(disturbance) > alpha
-    begins = np.flatnonzero(above[:-1] | above[1:])
-    largest, speed, index = 0.0, 0.0, 0
-    while index < len(steps):
+    columns = np.exp(-damping * steps), effective_steps, values[:-1], values[1:]
+    largest, speed, sign = 0.0, 0.0, 1.0
+    for remaining_share, step, before, after in zip(*(column.tolist() for column in columns), strict=True):
         if speed == 0.0:
-            # on to the next pulse
-            begin = int(np.searchsorted(begins, index))
-            if begin == len(begins):
-                break
-            index = int(begins[begin])
-            sign = np.sign(disturbance[index + 1] if above[index + 1] else disturbance[index])
-            push = sign * 0.5 * (disturbance[:-1] + disturbance[1:]) - alpha
+            # that of the pulse that may begin here
+            sign = math.copysign(1.0, after if abs(after) > alpha else before)
         # the other sign of d pulls back
-        speed = max(speed * remaining_share[index] + push[index] * effective_steps[index], 0.0)
-        largest = max(largest, float(speed))
-        index += 1
+        speed = max(speed * remaining_share + (sign * 0.5 * (before + after) - alpha) * step, 0.0)
+        largest = max(largest, speed)
     return largest
 
 
@@ -149,16 +154,9 @@ def _half_cycle(
 
 
 def simulate_error(
-    lambda_: float,
-    alpha: float,
-    times: np.ndarray,
-    disturbance: np.ndarray,
-    *,
-    damping: float = 0.0,
-    position_error: float = 0.0,
-    velocity_error: float,
+    lambda_: float, alpha: float, disturbance: Disturbance, *, position_error: float = 0.0, velocity_error: float
 ) -> ErrorPath:
-    """Simulate the error system in continuous time under a disturbance (rad/s^2) that is linear between its samples.
+    """Simulate the error system in continuous time.
 
     Half cycles by Runge-Kutta of order eight, relative tolerance 1e-9. An error that has fallen to 1e-4 of its first peak
     counts as zero, and stays there until |d| exceeds alpha.
@@ -166,32 +164,30 @@ def simulate_error(
     Args:
         lambda_: gain, rad^0.5/s.
         alpha: gain, rad/s^2.
-        times: of the samples (s), shape (n,).
-        disturbance: samples (rad/s^2), shape (n,).
-        damping: viscous damping of x2, 1/s.
+        disturbance: what acts on the error.
         position_error: x1 at the first sample (rad).
         velocity_error: x2 there (rad/s).
     """
+    times, values, damping = disturbance
     time, end = float(times[0]), float(times[-1])
     sign = np.sign(position_error) or np.sign(velocity_error) or 1.0
     y, x2 = float(np.sqrt(abs(position_error))), float(sign * velocity_error)
     scale = max(abs(x2), y * np.sqrt(2.0 * alpha))
     passages, peaks, largest, end_time = [], [], abs(x2), np.inf
-    disturbance_at = _interpolator(times, disturbance)
     if y == 0.0 and x2 != 0.0:
         passages, peaks = [time], [x2]
     for _ in range(_MOST_HALF_CYCLES):
         if max(abs(x2), y) <= _ZERO_RATIO * scale:
             end_time = min(end_time, time)
-            later = np.flatnonzero((times >= time) & (np.abs(disturbance) > alpha))
+            later = np.flatnonzero((times >= time) & (np.abs(values) > alpha))
             if not len(later):
                 break
-            sign = float(np.sign(disturbance[later[0]]))
-            time, x2 = _start_of_pulse(sign * disturbance[later[0] :] - alpha, times[later[0] :])
+            sign = float(np.sign(values[later[0]]))
+            time, x2 = _start_of_pulse(sign * values[later[0] :] - alpha, times[later[0] :])
             y = x2 / max(lambda_, np.sqrt(alpha))
             scale, end_time = max(scale, x2), np.inf
         x2, time, largest_speed, has_passed = _half_cycle(
-            lambda_, alpha, lambda t, sign=sign: sign * disturbance_at(t), damping, (y, x2, time), end
+            lambda_, alpha, lambda t, sign=sign: sign * float(np.interp(t, times, values)), damping, (y, x2, time), end
         )
         largest = max(largest, largest_speed)
         if has_passed:
@@ -216,21 +212,6 @@ def _start_of_pulse(excess: np.ndarray, times: np.ndarray) -> tuple[float, float
     return float(times[index]), float(speed[index]) or 1e-12 * float(excess[0])
 
 
-def _interpolator(times: np.ndarray, values: np.ndarray) -> Callable[[float], float]:
-    """Return a function like `np.interp` for single numbers, for which NumPy takes ten times as long."""
-    time_list, value_list = times.tolist(), values.tolist()
-
-    def interpolate(time: float) -> float:
-        i = bisect_right(time_list, time)
-        if i in (0, len(time_list)):
-            return value_list[min(i, len(time_list) - 1)]
-        return (value_list[i] - value_list[i - 1]) / (time_list[i] - time_list[i - 1]) * (
-            time - time_list[i - 1]
-        ) + value_list[i - 1]
-
-    return interpolate
-
-
 class SineCycle(NamedTuple):
     """Limit cycles under d = amplitude sin(2 pi frequency t), by their peaks V (rad/s).
 
@@ -243,107 +224,97 @@ class SineCycle(NamedTuple):
 
 SINE_LIMIT = 16.0 * 2.0**0.5 / np.pi**3
 """lambda sqrt(alpha) / amplitude, up to which a sine upholds a limit cycle without damping: 0.730."""
-
-
-def _balance_phase_sine(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float) -> float:
-    """Return the sine of the phase at which the disturbance makes up for the losses of a half cycle."""
-    friction = damping * alpha * np.pi**3 / (24.0 * 2.0 * np.pi * frequency)
-    return float((friction + lambda_ * np.sqrt(alpha) / SINE_LIMIT) / amplitude)
-
-
-def sine_cycle(lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0) -> SineCycle | None:
-    """Find the limit cycles of the error under a sine (rad/s^2, Hz) by balance of energy; None if there is none.
-
-    A half cycle takes half a period, in which x2 falls by 2 V = pi alpha / w - 2 (amplitude / w) cos(phase), with w = 2 pi
-    frequency. The sine puts in the energy 2 alpha amplitude sin(phase) / w^2; damping and lambda take out what they take of
-    a parabola. The sine of the phase is at most 1: without damping there is a cycle where lambda sqrt(alpha) <
-    `SINE_LIMIT` times the amplitude.
-    """
-    sine = _balance_phase_sine(lambda_, alpha, amplitude, frequency, damping)
-    if sine > 1.0:
-        return None
-    circular = 2.0 * np.pi * frequency
-    middle, half = 0.5 * np.pi * alpha / circular, amplitude * np.sqrt(1.0 - sine**2) / circular
-    return SineCycle(float(middle + half), float(middle - half))
-
-
-def least_cycle_frequency(lambda_: float, alpha: float, amplitude: float, damping: float) -> float:
-    """Return the least frequency (Hz) at which a sine of this amplitude (rad/s^2) has a limit cycle, by :func:`sine_cycle`.
-
-    It is 0 without damping, and `inf` if lambda alone forbids a cycle. It is too high if alpha is close to the amplitude.
-    """
-    driving_amplitude = amplitude - lambda_ * np.sqrt(alpha) / SINE_LIMIT
-    return float(damping * alpha * np.pi**2 / (48.0 * driving_amplitude)) if driving_amplitude > 0.0 else np.inf
-
-
-def _find_cycle(
-    lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float, start: tuple[float, float]
-) -> tuple[float, float] | None:
-    """Find a peak (rad/s) and phase that repeat after a simulated half cycle, by Newton's method; None without one."""
-    circular = 2.0 * np.pi * frequency
-    unit = alpha / circular
-
-    def cycle_residual(unknowns: np.ndarray) -> np.ndarray:
-        peak, phase = unknowns[0] * unit, unknowns[1]
-        if peak <= 0.0:
-            return np.array([1.0, 1.0])
-        x2, time, _, _ = _half_cycle(
-            lambda_, alpha, lambda t: amplitude * np.sin(circular * t + phase), damping, (0.0, peak, 0.0), np.inf
-        )
-        return np.array([(-x2 - peak) / unit, time * circular / np.pi - 1.0])
-
-    solution = root(cycle_residual, (start[0] / unit, start[1]), method="hybr")
-    return (
-        (float(solution.x[0]) * unit, float(solution.x[1]))
-        if solution.success and np.abs(solution.fun).max() < 1e-6
-        else None
-    )
-
-
-def sine_cycle_simulated(
-    lambda_: float, alpha: float, amplitude: float, frequency: float, damping: float = 0.0
-) -> SineCycle | None:
-    """Find the limit cycles without the approximation of :func:`sine_cycle`, which is the start of Newton's method.
-
-    Returns None if the approximation has no cycle, or if the method does not converge.
-    """
-    drive = lambda_, alpha, amplitude, frequency, damping
-    predicted = sine_cycle(*drive)
-    if predicted is None:
-        return None
-    phase = float(np.arcsin(_balance_phase_sine(*drive)))
-    starts = (predicted.stable, np.pi - phase), (predicted.threshold, phase)
-    stable, threshold = (_find_cycle(*drive, start) for start in starts)
-    return None if stable is None or threshold is None else SineCycle(stable[0], threshold[0])
-
-
 _HALVINGS = 10
 """Halvings of a factor of four, when a least frequency is sought: to 0.14 %."""
 
 
-def least_cycle_frequency_simulated(lambda_: float, alpha: float, amplitude: float, damping: float) -> float | None:
-    """Find the least frequency (Hz) of a limit cycle without the approximation of :func:`least_cycle_frequency`.
+class SineError(NamedTuple):
+    """The error under sines of one amplitude (rad/s^2), with damping (1/s); gains in rad^0.5/s and rad/s^2."""
 
-    The stable cycle is followed from twice the approximate frequency down to where Newton's method finds none. Returns None
-    if it finds none at all, or if the approximation is 0 or `inf`.
-    """
-    high = 2.0 * least_cycle_frequency(lambda_, alpha, amplitude, damping)
-    if not 0.0 < high < np.inf:
-        return None
-    drive = lambda_, alpha, amplitude, high, damping
-    predicted = sine_cycle(*drive)
-    assert predicted is not None
-    phase = np.pi - float(np.arcsin(_balance_phase_sine(*drive)))
-    last_cycle = _find_cycle(*drive, (predicted.stable, phase))
-    if last_cycle is None:
-        return None
-    low = 0.25 * high
-    for _ in range(_HALVINGS):
-        middle = float(np.sqrt(low * high))
-        # by homogeneity peaks go with the period
-        cycle = _find_cycle(lambda_, alpha, amplitude, middle, damping, (last_cycle[0] * high / middle, last_cycle[1]))
+    lambda_: float
+    alpha: float
+    amplitude: float
+    damping: float = 0.0
+
+    def _phase_sine(self, frequency: float) -> float:
+        """Return the sine of the phase at which the disturbance makes up for the losses of a half cycle."""
+        friction = self.damping * self.alpha * np.pi**3 / (24.0 * 2.0 * np.pi * frequency)
+        return (friction + self.lambda_ * math.sqrt(self.alpha) / SINE_LIMIT) / self.amplitude
+
+    def predict_cycle(self, frequency: float) -> SineCycle | None:
+        """Find the limit cycles under a sine of a frequency (Hz) by balance of energy; None if there is none.
+
+        A half cycle takes half a period, in which x2 falls by 2 V = pi alpha / w - 2 (amplitude / w) cos(phase), with w = 2
+        pi frequency. The sine puts in the energy 2 alpha amplitude sin(phase) / w^2; damping and lambda take out what they
+        take of a parabola. The sine of the phase is at most 1: without damping there is a cycle where lambda sqrt(alpha) <
+        `SINE_LIMIT` times the amplitude.
+        """
+        sine, circular = self._phase_sine(frequency), 2.0 * np.pi * frequency
+        if sine > 1.0:
+            return None
+        middle, half = 0.5 * np.pi * self.alpha / circular, self.amplitude * math.sqrt(1.0 - sine**2) / circular
+        return SineCycle(middle + half, middle - half)
+
+    def predict_least_frequency(self) -> float:
+        """Return the least frequency (Hz) at which a sine has a limit cycle, by :meth:`predict_cycle`.
+
+        It is 0 without damping, and `inf` if lambda alone forbids a cycle. It is too high if alpha is close to the
+        amplitude.
+        """
+        driving_amplitude = self.amplitude - self.lambda_ * math.sqrt(self.alpha) / SINE_LIMIT
+        return self.damping * self.alpha * np.pi**2 / (48.0 * driving_amplitude) if driving_amplitude > 0.0 else np.inf
+
+    def _find_cycle(self, frequency: float, peak: float, phase: float) -> tuple[float, float] | None:
+        """Find a peak (rad/s) and phase near given ones that repeat after a simulated half cycle, by Newton's method; None
+        without them."""
+        circular = 2.0 * np.pi * frequency
+        unit = self.alpha / circular
+
+        def cycle_residual(unknowns: np.ndarray) -> np.ndarray:
+            peak, phase = unknowns[0] * unit, unknowns[1]
+            if peak <= 0.0:
+                return np.array([1.0, 1.0])
+            push, start = (lambda t: self.amplitude * np.sin(circular * t + phase)), (0.0, peak, 0.0)
+            x2, time, _, _ = _half_cycle(self.lambda_, self.alpha, push, self.damping, start, np.inf)
+            return np.array([(-x2 - peak) / unit, time * circular / np.pi - 1.0])
+
+        solution = root(cycle_residual, (peak / unit, phase), method="hybr")
+        has_converged = solution.success and np.abs(solution.fun).max() < 1e-6
+        return (float(solution.x[0]) * unit, float(solution.x[1])) if has_converged else None
+
+    def simulate_cycle(self, frequency: float) -> SineCycle | None:
+        """Find the limit cycles without the approximation of :meth:`predict_cycle`, where Newton's method begins.
+
+        Returns None if the approximation has no cycle, or if the method does not converge.
+        """
+        predicted = self.predict_cycle(frequency)
+        if predicted is None:
+            return None
+        phase = math.asin(self._phase_sine(frequency))
+        stable = self._find_cycle(frequency, predicted.stable, np.pi - phase)
+        threshold = self._find_cycle(frequency, predicted.threshold, phase)
+        return None if stable is None or threshold is None else SineCycle(stable[0], threshold[0])
+
+    def simulate_least_frequency(self) -> float | None:
+        """Find the least frequency (Hz) of a limit cycle without the approximation of :meth:`predict_least_frequency`.
+
+        The stable cycle is followed from twice the approximate frequency down to where Newton's method finds none. Returns
+        None if it finds none at all, or if the approximation is 0 or `inf`.
+        """
+        high = 2.0 * self.predict_least_frequency()
+        predicted = self.predict_cycle(high) if 0.0 < high < np.inf else None
+        if predicted is None:
+            return None
+        cycle = self._find_cycle(high, predicted.stable, np.pi - math.asin(self._phase_sine(high)))
         if cycle is None:
-            low = middle
-        else:
-            high, last_cycle = middle, cycle
-    return high
+            return None
+        low = 0.25 * high
+        for _ in range(_HALVINGS):
+            middle = math.sqrt(low * high)
+            # by homogeneity peaks go with the period
+            next_cycle = self._find_cycle(middle, cycle[0] * high / middle, cycle[1])
+            if next_cycle is None:
+                low = middle
+            else:
+                high, cycle = middle, next_cycle
+        return high

@@ -138,7 +138,7 @@ def _verify_levels(sides: list[str], stages: Stages) -> Verdict:
                 {"damping": damping, "alpha_ratio": error_map.alpha, "least_lambda_ratio": boundary}
                 for damping, boundary in error_map.boundary_by_damping.items()
             ],
-            "marks": judge_marks(config, studies["drive"], stages),
+            "marks": judge_marks(studies["drive"], stages),
             "loop_margins": _find_loop_margins(stages),
             "counterexamples": at_true_bound.head(_MOST_LISTED).to_dict("records"),
             "counterexamples_in_all": len(at_true_bound),

@@ -5,7 +5,7 @@ import pytest
 from small_study import ALPHA, LAMBDA, listed_axis, rigid_study
 
 from jaxbl.config import read_config, with_values
-from jaxbl.gains.below_bound import missing_acceleration, summarise_converged_below
+from jaxbl.gains.below_bound import read_disturbance, summarise_converged_below
 from jaxbl.sweeps.sweep import sweep
 from jaxbl.sweeps.trial import run
 
@@ -55,8 +55,8 @@ def test_no_run_is_below_its_bound(sweep_frame):
 def test_the_disturbance_is_what_the_model_lacks():
     study = with_values(STUDY, {AMPLITUDE: 0.3})
     trace = run(study).trace
-    summary, velocity = missing_acceleration(study.build().drive, "motor", trace), trace["motor.velocity"].to_numpy()
+    missing, velocity = read_disturbance(study.build().drive, "motor", trace).values, trace["motor.velocity"].to_numpy()
     slips = np.abs(velocity) > 0.05
     assert 0.2 < slips.mean() < 1.0
     # dry friction of 0.1 N m at 0.05 kg m^2; velocity and acceleration are half a period apart
-    np.testing.assert_allclose(summary[slips], -2.0 * np.sign(velocity[slips]), rtol=0.01)
+    np.testing.assert_allclose(missing[slips], -2.0 * np.sign(velocity[slips]), rtol=0.01)

@@ -34,7 +34,7 @@ def _few_digits():
 
 @pytest.fixture(scope="module")
 def judged_marks(_few_digits):
-    return {mark["name"]: mark for mark in judge_marks(STUDY, STUDY, Stages(STUDY, "verify"))}
+    return {mark["name"]: mark for mark in judge_marks(STUDY, Stages(STUDY, "verify"))}
 
 
 def test_gains_that_hold_the_exact_condition_need_no_explanation(judged_marks):
@@ -76,7 +76,7 @@ def explain_position_error(position_error):
     data = STUDY.to_dict() | {"verify": {"marks": MARKS[1:2]}}
     data["observer"]["motor"] |= {"position_error": position_error, "velocity_error": 0.0}
     study = read_config(data)
-    (mark,) = judge_marks(study, study, Stages(study, "verify"))
+    (mark,) = judge_marks(study, Stages(study, "verify"))
     return mark["on_this_disturbance"]
 
 
@@ -96,5 +96,5 @@ def test_a_larger_start_ends_in_a_limit_cycle():
 
 def test_without_alpha_there_is_nothing_to_explain():
     study = read_config(STUDY.to_dict() | {"verify": {"marks": [{"name": "none", "lambda": 1.0, "alpha": 0.0}]}})
-    (mark,) = judge_marks(study, study, Stages(study, "verify"))
+    (mark,) = judge_marks(study, Stages(study, "verify"))
     assert mark["on_this_disturbance"] is None

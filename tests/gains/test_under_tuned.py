@@ -6,16 +6,7 @@ from scipy.integrate import quad, solve_ivp
 from small_study import small_study
 
 from jaxbl.config import read_config
-from jaxbl.gains.under_tuned import (
-    SINE_LIMIT,
-    excursion,
-    least_cycle_frequency,
-    least_cycle_frequency_simulated,
-    peak_law,
-    simulate_error,
-    sine_cycle,
-    sine_cycle_simulated,
-)
+from jaxbl.gains.under_tuned import SINE_LIMIT, Disturbance, SineError, excursion, peak_law, simulate_error
 from jaxbl.observer.conditions import least_lambda_exact
 from jaxbl.sweeps.trial import run
 
@@ -61,7 +52,7 @@ SLOW_SINE = 1.5 * np.sin(TIMES)
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.0, 0.0), (0.0, 1.0), (0.01, 0.0), (0.005, 3.0)])
 def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
-    law = peak_law(lambda_, 1.8, TIMES, SLOW_SINE, damping=damping, peak=0.02)
+    law = peak_law(lambda_, 1.8, Disturbance(TIMES, SLOW_SINE, damping), 0.02)
     times, x2 = simulate_peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 2.0, damping, (0.0, 0.02), least_peak=1.8e-3)
     expected = np.interp(times, TIMES, law)
     is_compared = expected > 2e-3
@@ -72,31 +63,31 @@ def test_law_of_peaks_under_a_slow_disturbance(lambda_, damping):
 
 
 def test_without_losses_peaks_come_back_with_the_disturbance():
-    law = peak_law(0.0, 1.8, TIMES, SLOW_SINE, damping=0.0, peak=0.02)
+    law = peak_law(0.0, 1.8, Disturbance(TIMES, SLOW_SINE, 0.0), 0.02)
     turn = np.interp(0.5 * np.pi, TIMES, law) / 0.02
     assert turn == pytest.approx((1.0 - 1.5**2 / 1.8**2) ** (1.0 / 3.0), rel=1e-5)
     assert np.interp(2.0 * np.pi, TIMES, law) == pytest.approx(0.02, rel=1e-5)
 
 
 def test_the_law_at_a_disturbance_that_touches_alpha():
-    law = peak_law(0.01, 1.5, TIMES, 1.5 * np.sin(TIMES), damping=1.0, peak=0.02)
+    law = peak_law(0.01, 1.5, Disturbance(TIMES, 1.5 * np.sin(TIMES), 1.0), 0.02)
     assert np.isfinite(law).all()
     assert (law >= 0.0).all()
 
 
 def test_the_law_ends_after_a_finite_time():
-    law = peak_law(0.02, 1.8, TIMES, 0.0 * TIMES, damping=1.5, peak=0.1)
+    law = peak_law(0.02, 1.8, Disturbance(TIMES, 0.0 * TIMES, 1.5), 0.1)
     # V' = -V b / 3 - k
     rate = 0.25 * np.pi * 0.02 * 1.8 / np.sqrt(2.0 * 1.8)
     end = np.log1p(0.1 * 0.5 / rate) / 0.5
     assert TIMES[np.argmax(law == 0.0)] == pytest.approx(end, abs=0.01)
-    simulated = simulate_error(0.02, 1.8, TIMES, 0.0 * TIMES, damping=1.5, velocity_error=0.1)
+    simulated = simulate_error(0.02, 1.8, Disturbance(TIMES, 0.0 * TIMES, 1.5), velocity_error=0.1)
     assert simulated.end_time == pytest.approx(end, rel=0.01)
 
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(0.3, 0.0), (0.05, 1.0), (2.5, 0.0)])
 def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
-    simulated = simulate_error(lambda_, 1.8, TIMES, SLOW_SINE, damping=damping, velocity_error=0.5)
+    simulated = simulate_error(lambda_, 1.8, Disturbance(TIMES, SLOW_SINE, damping), velocity_error=0.5)
     times, x2 = simulate_peaks(lambda_, 1.8, lambda t: 1.5 * np.sin(t), 3.0, damping, (0.0, 0.5), most=12)
     assert simulated.largest == 0.5
     assert simulated.peaks[0] == 0.5
@@ -108,7 +99,7 @@ def test_simulated_error_against_scipy_in_other_states(lambda_, damping):
 
 
 def test_simulated_error_from_a_position_error():
-    simulated = simulate_error(0.3, 1.8, TIMES, SLOW_SINE, position_error=-0.2, velocity_error=0.1)
+    simulated = simulate_error(0.3, 1.8, Disturbance(TIMES, SLOW_SINE), position_error=-0.2, velocity_error=0.1)
     times, x2 = simulate_peaks(0.3, 1.8, lambda t: 1.5 * np.sin(t), 3.0, 0.0, (-0.2, 0.1), most=3)
     np.testing.assert_allclose(simulated.peaks[:3], np.abs(x2), rtol=2e-4)
     np.testing.assert_allclose(simulated.times[:3], times, rtol=2e-4)
@@ -118,20 +109,20 @@ def test_excursion_of_a_pulse():
     times = np.linspace(0.0, 3.0, 3001)
     pulse = np.where((times > 0.9995) & (times < 1.5005), 2.2, 0.5)
     # edges of a sample's length
-    assert excursion(2.0, times, pulse, 0.0) == pytest.approx(0.2 * 0.5, rel=2e-3)
-    assert excursion(2.0, times, -pulse, 1.5) == pytest.approx(0.2 / 1.5 * -np.expm1(-0.75), rel=2e-3)
-    assert excursion(2.3, times, pulse, 0.0) == 0.0
+    assert excursion(2.0, Disturbance(times, pulse, 0.0)) == pytest.approx(0.2 * 0.5, rel=2e-3)
+    assert excursion(2.0, Disturbance(times, -pulse, 1.5)) == pytest.approx(0.2 / 1.5 * -np.expm1(-0.75), rel=2e-3)
+    assert excursion(2.3, Disturbance(times, pulse, 0.0)) == 0.0
     sine = 2.0 * np.sin(2.0 * times)
     area, _ = quad(lambda t: max(2.0 * np.sin(2.0 * t) - 1.7, 0.0), 0.0, 1.5, points=[0.5 * np.arcsin(0.85)])
-    assert excursion(1.7, times, sine, 0.0) == pytest.approx(area, rel=1e-4)
+    assert excursion(1.7, Disturbance(times, sine, 0.0)) == pytest.approx(area, rel=1e-4)
 
 
 @pytest.mark.parametrize(("lambda_", "damping"), [(1.24, 0.0), (1.24, 3.0), (3.0, 0.0)])
 def test_excursions_where_the_error_settles_between_pulses(lambda_, damping):
     times = np.linspace(0.0, 12.5, 12501)
-    disturbance = 1.2 * np.sin(1.005 * times) + 0.4 * np.sin(2.7 * times + 1.0)
-    simulated = simulate_error(lambda_, 1.3, times, disturbance, damping=damping, velocity_error=0.0)
-    assert simulated.largest == pytest.approx(excursion(1.3, times, disturbance, damping), rel=1e-4)
+    disturbance = Disturbance(times, 1.2 * np.sin(1.005 * times) + 0.4 * np.sin(2.7 * times + 1.0), damping)
+    simulated = simulate_error(lambda_, 1.3, disturbance, velocity_error=0.0)
+    assert simulated.largest == pytest.approx(excursion(1.3, disturbance), rel=1e-4)
 
 
 CYCLES = [(1.15, 0.3, 0.0), (5.0, 0.1, 0.0), (1.8, 0.01, 0.3)]
@@ -140,7 +131,8 @@ CYCLES = [(1.15, 0.3, 0.0), (5.0, 0.1, 0.0), (1.8, 0.01, 0.3)]
 @pytest.mark.parametrize(("alpha", "lambda_", "damping"), CYCLES)
 def test_limit_cycle_under_a_sine(alpha, lambda_, damping):
     frequency = 0.5 / np.pi
-    predicted, simulated = (of(lambda_, alpha, 1.0, frequency, damping) for of in (sine_cycle, sine_cycle_simulated))
+    error = SineError(lambda_, alpha, 1.0, damping)
+    predicted, simulated = error.predict_cycle(frequency), error.simulate_cycle(frequency)
     assert predicted.stable == pytest.approx(simulated.stable, rel=0.06)
     assert predicted.threshold == pytest.approx(simulated.threshold, rel=0.12)
     assert 0.0 < simulated.threshold < simulated.stable
@@ -156,12 +148,12 @@ def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
     assert round(SINE_LIMIT, 3) == 0.73
     assert limit < float(least_lambda_exact(alpha, 1.0))
     frequency = 0.5 / np.pi
-    assert sine_cycle(1.01 * limit, alpha, 1.0, frequency) is None
-    assert sine_cycle_simulated(1.01 * limit, alpha, 1.0, frequency) is None
-    assert sine_cycle(0.99 * limit, alpha, 1.0, frequency) is not None
+    assert SineError(1.01 * limit, alpha, 1.0).predict_cycle(frequency) is None
+    assert SineError(1.01 * limit, alpha, 1.0).simulate_cycle(frequency) is None
+    assert SineError(0.99 * limit, alpha, 1.0).predict_cycle(frequency) is not None
     # without approximation the limit is at most 5 % larger: beyond that errors of any phase go to zero
     phase = np.pi - np.arcsin(0.9)
-    start = 0.0, sine_cycle(0.9 * limit, alpha, 1.0, frequency).stable
+    start = 0.0, SineError(0.9 * limit, alpha, 1.0).predict_cycle(frequency).stable
     _, lasting = simulate_peaks(0.9 * limit, alpha, lambda t: np.sin(t + phase), 500.0, 0.0, start, most=60)
     assert len(lasting) == 60
     assert np.abs(lasting[-4:]).min() > 0.9 * start[1]
@@ -175,13 +167,13 @@ def test_a_sine_upholds_a_cycle_up_to_a_lambda_below_the_exact_one(alpha):
 
 
 def test_least_frequency_of_a_cycle():
-    numbers = {"lambda_": 0.005, "alpha": 1.8, "amplitude": 1.56, "damping": 3.0}
-    least = least_cycle_frequency(*numbers.values())
-    cycles = [sine_cycle(0.005, 1.8, 1.56, share * least, 3.0) for share in (0.999, 1.001)]
+    error = SineError(0.005, 1.8, 1.56, 3.0)
+    least = error.predict_least_frequency()
+    cycles = [error.predict_cycle(share * least) for share in (0.999, 1.001)]
     assert cycles[0] is None
     assert cycles[1] is not None
-    assert least_cycle_frequency(0.005, 1.8, 1.56, 0.0) == 0.0
-    assert least_cycle_frequency(1.0, 1.8, 1.56, 3.0) == np.inf
+    assert SineError(0.005, 1.8, 1.56, 0.0).predict_least_frequency() == 0.0
+    assert SineError(1.0, 1.8, 1.56, 3.0).predict_least_frequency() == np.inf
 
 
 @pytest.mark.parametrize(("alpha", "ratio"), [(1.15, 0.757), (2.0, 0.926)])
@@ -189,8 +181,9 @@ def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
     """Below it errors of any size and phase go to zero; above it not."""
     # a hundredth is small enough: the many half cycles of smaller errors would take long
     monkeypatch.setattr("jaxbl.gains.under_tuned._ZERO_RATIO", 0.01)
-    least = least_cycle_frequency_simulated(0.005, alpha, 1.0, 3.0)
-    assert least / least_cycle_frequency(0.005, alpha, 1.0, 3.0) == pytest.approx(ratio, rel=0.01)
+    error = SineError(0.005, alpha, 1.0, 3.0)
+    least = error.simulate_least_frequency()
+    assert least / error.predict_least_frequency() == pytest.approx(ratio, rel=0.01)
     # ends differ by a factor of ten: no digits are needed
     monkeypatch.setattr("jaxbl.gains.under_tuned._TOLERANCE", 1e-6)
 
@@ -198,7 +191,7 @@ def test_least_frequency_without_approximation(monkeypatch, alpha, ratio):
         """The last peak over the first one."""
         times = np.linspace(0.0, periods / frequency, round(60 * periods) + 1)
         sine = np.sin(2.0 * np.pi * frequency * times + phase)
-        path = simulate_error(0.005, alpha, times, sine, damping=3.0, velocity_error=0.4 * alpha / frequency)
+        path = simulate_error(0.005, alpha, Disturbance(times, sine, 3.0), velocity_error=0.4 * alpha / frequency)
         return path.peaks[-1] / path.peaks[0]
 
     assert max(last_peak(0.95 * least, phase, 15.0) for phase in (0.0, 0.7 * np.pi, 1.4 * np.pi)) < 0.02
@@ -220,6 +213,6 @@ def test_gains_of_table_1_end_in_the_cycle_on_the_papers_drive_at_a_higher_frequ
     # alpha covers all of it
     assert np.abs(missing).max() < 1.8
     turns = np.exp(-2j * np.pi * frequency * part["t"].to_numpy())
-    simulated = sine_cycle_simulated(0.005, 1.8, 2.0 * abs(np.mean(missing * turns)), frequency, 3.0)
+    simulated = SineError(0.005, 1.8, 2.0 * abs(np.mean(missing * turns)), 3.0).simulate_cycle(frequency)
     error = np.abs(velocity - part["motor.velocity_estimate"].to_numpy()).max()
     assert error == pytest.approx(simulated.stable, rel=0.02)
