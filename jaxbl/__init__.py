@@ -7,100 +7,52 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .chain import (
-        Experiment as Experiment,
-        Run as Run,
-        Sample as Sample,
-        Signals as Signals,
-        State as State,
-        initial_state as initial_state,
-    )
-    from .config import Config as Config, read_config as read_config
+    from .chain import Experiment, Run, Sample, Signals, State, initial_state
+    from .config import Config, read_config
     from .control import (
-        AbstractController as AbstractController,
-        AbstractReference as AbstractReference,
-        Cascade as Cascade,
-        ControllerState as ControllerState,
-        Moves as Moves,
-        Ramp as Ramp,
-        RecordedReference as RecordedReference,
-        SineReference as SineReference,
-        StateFeedback as StateFeedback,
-        StepsReference as StepsReference,
+        AbstractController,
+        AbstractReference,
+        Cascade,
+        ControllerState,
+        Moves,
+        Ramp,
+        RecordedReference,
+        SineReference,
+        StateFeedback,
+        StepsReference,
     )
-    from .diagnosis.diagnose import Diagnosis as Diagnosis, diagnose as diagnose
-    from .drive import (
-        AbstractDrive as AbstractDrive,
-        DeadZone as DeadZone,
-        Encoders as Encoders,
-        Initial as Initial,
-        LinearShaft as LinearShaft,
-        Rigid as Rigid,
-        SigmoidBacklash as SigmoidBacklash,
-        TwoInertia as TwoInertia,
-    )
-    from .drive.excitation import (
-        Chirp as Chirp,
-        Multisine as Multisine,
-        Prbs as Prbs,
-        Recorded as Recorded,
-        Sine as Sine,
-        Steps as Steps,
-    )
-    from .errors import InputError as InputError, NoResult as NoResult
-    from .estimation.element import ElementIdentification as ElementIdentification, identify_element as identify_element
-    from .estimation.identify import Identification as Identification, identify as identify
-    from .exports import Export as Export, export as export
-    from .functions import (
-        Grid as Grid,
-        experiment as experiment,
-        metrics as metrics,
-        observe as observe,
-        register as register,
-        samples as samples,
-        simulate as simulate,
-        step as step,
-        sweep_arrays as sweep_arrays,
-        with_values as with_values,
-    )
-    from .gains.accuracy_laws import Law as Law, accuracy_laws as accuracy_laws
-    from .gains.tune import Tuning as Tuning, tune as tune
-    from .gains.verify import Verdict as Verdict, verify as verify
-    from .monitoring.watch import Watch as Watch, watch as watch
+    from .diagnosis.diagnose import Diagnosis, diagnose
+    from .drive import AbstractDrive, DeadZone, Encoders, Initial, LinearShaft, Rigid, SigmoidBacklash, TwoInertia
+    from .drive.excitation import Chirp, Multisine, Prbs, Recorded, Sine, Steps
+    from .errors import InputError, NoResult
+    from .estimation.element import ElementIdentification, identify_element
+    from .estimation.identify import Identification, identify
+    from .exports import Export, export
+    from .functions import Grid, experiment, metrics, observe, register, samples, simulate, step, sweep_arrays, with_values
+    from .gains.accuracy_laws import Law, accuracy_laws
+    from .gains.tune import Tuning, tune
+    from .gains.verify import Verdict, verify
+    from .monitoring.watch import Watch, watch
     from .observer import (
-        AbstractObserver as AbstractObserver,
-        DirtyDerivative as DirtyDerivative,
-        Estimate as Estimate,
-        ExplicitSuperTwisting as ExplicitSuperTwisting,
-        ExtendedState as ExtendedState,
-        ImplicitSuperTwisting as ImplicitSuperTwisting,
-        Kalman as Kalman,
-        Luenberger as Luenberger,
-        Observers as Observers,
-        ObserverState as ObserverState,
+        AbstractObserver,
+        DirtyDerivative,
+        Estimate,
+        ExplicitSuperTwisting,
+        ExtendedState,
+        ImplicitSuperTwisting,
+        Kalman,
+        Luenberger,
+        Observers,
+        ObserverState,
     )
-    from .quantity import Quantity as Quantity
-    from .records import (
-        Inspection as Inspection,
-        LogTable as LogTable,
-        Record as Record,
-        inspect as inspect,
-        read_record as read_record,
-    )
-    from .report.results import describe as describe, draw as draw, write_report as write_report
-    from .sweeps.compare import Comparison as Comparison, compare as compare
-    from .sweeps.status import Status as Status, status as status
-    from .sweeps.sweep import (
-        StudyResult as StudyResult,
-        dry_run as dry_run,
-        open_study as open_study,
-        repair as repair,
-        share as share,
-        submit as submit,
-        sweep as sweep,
-    )
-    from .sweeps.trial import Trial as Trial, run as run
-    from .throughput import bench as bench
+    from .quantity import Quantity
+    from .records import Inspection, LogTable, Record, inspect, read_record
+    from .report.results import describe, draw, write_report
+    from .sweeps.compare import Comparison, compare
+    from .sweeps.status import Status, status
+    from .sweeps.sweep import StudyResult, dry_run, open_study, repair, share, submit, sweep
+    from .sweeps.trial import Trial, run
+    from .throughput import bench
 
 # the same for loading; a test compares the two
 _NAMES = {
