@@ -31,8 +31,6 @@ def rows(table: type[BaseModel], prefix: str) -> list[str]:
         key = field.alias or name
         if name in ("kind", "law") and len(get_args(field.annotation)) == 1:
             continue
-        if field.description == config.experiment.OTHER_KINDS:
-            continue
         inner = tables_of(field.annotation)
         if len(inner) == 1:
             several = "[]" if get_origin(field.annotation) is list else ""

@@ -74,30 +74,40 @@ class RecordedReferenceTable(_FileTable):
         return RecordedReference.through(*self._load_columns(), gain=self.gain)
 
 
-def _table_of_kind(kind: str, cls: type) -> type[Table]:
-    return table_for(cls, kind=kind)
+_FILE_TABLES = {Recorded: RecordedTable, RecordedReference: RecordedReferenceTable}
 
 
-DriveTable = tagged_union(DRIVES, _table_of_kind, "kind")
+def _signal_table(kind: str, cls: type) -> type[Table]:
+    return _FILE_TABLES.get(cls) or table_for(cls, kind=kind)
+
+
+DriveTable = tagged_union(DRIVES)
 TransmissionTable = tagged_union(TRANSMISSIONS, lambda law, cls: table_for(cls, law=law), "law")
-ExcitationTable = tagged_union(
-    EXCITATIONS, lambda kind, cls: RecordedTable if kind == "recorded" else table_for(cls, kind=kind), "kind"
-)
-EffectTable = tagged_union(EFFECTS, lambda kind, cls: table_for(cls, partial(make_effect, kind), kind=kind), "kind")
-ControllerTable = tagged_union(CONTROLLERS, _table_of_kind, "kind")
-ReferenceTable = tagged_union(
-    REFERENCES, lambda kind, cls: RecordedReferenceTable if kind == "recorded" else table_for(cls, kind=kind), "kind"
-)
+ExcitationTable = tagged_union(EXCITATIONS, _signal_table)
+EffectTable = tagged_union(EFFECTS, lambda kind, cls: table_for(cls, partial(make_effect, kind), kind=kind))
+ControllerTable = tagged_union(CONTROLLERS)
+ReferenceTable = tagged_union(REFERENCES, _signal_table)
 InitialTable = table_for(Initial)
 EncodersTable = table_for(Encoders)
 EquivalentControlTable = table_for(EquivalentControl)
 IdentifierTable = table_for(Identifier)
 
 
-OTHER_KINDS = "a gain of other kinds of observer"
-"""What the table of a kind says of it."""
-_GAINS = {field.name: config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)}
-"""Gains of all observers: fields and config keys."""
+def _list_keys(schema: Any, table: Any) -> None:
+    schema["propertyNames"] = {"enum": [*schema["properties"], *table.further_keys()]}
+
+
+class _GainsTable(Table):
+    """Gains of an observer. Those of other kinds may stand beside them, for studies over `observer.kind`."""
+
+    model_config = ConfigDict(extra="allow", json_schema_extra=_list_keys)
+    __pydantic_extra__: dict[str, float]
+
+    @classmethod
+    def further_keys(cls) -> list[str]:
+        keys = (config_key(field.name) for observer in OBSERVERS.values() for field, _ in parameters(observer))
+        own_keys = {field.alias for field in cls.model_fields.values()}
+        return [key for key in dict.fromkeys(keys) if key not in own_keys]
 
 
 class _ObserverTable(Table):
@@ -129,14 +139,8 @@ class _ObserverTable(Table):
 
 
 def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
-    """The table of observers of a kind. Their sides may hold gains of other kinds, for studies over `observer.kind`."""
-    keys = {field.name for field, _ in parameters(cls)}
-    other_keys: dict[str, Any] = {
-        name: (float | None, declare_key(OTHER_KINDS, None, alias=key if key != name else None))
-        for name, key in _GAINS.items()
-        if name not in keys
-    }
-    gains = table_for(cls, base=create_model("OtherGains", __base__=Table, **other_keys))
+    """The table of observers of a kind."""
+    gains = table_for(cls, base=_GainsTable)
     sides: dict[str, Any] = {
         "motor": (gains, declare_key("gains of the motor observer")),
         "load": (gains | None, declare_key("gains of the load observer; none on a rigid drive", None)),
@@ -152,7 +156,7 @@ def _observer_table(kind: str, cls: type[AbstractObserver]) -> type[Table]:
 
 _USUAL = "super_twisting"
 ObserverTable = Annotated[
-    tagged_union(OBSERVERS, _observer_table, "kind"),
+    tagged_union(OBSERVERS, _observer_table),
     BeforeValidator(lambda table: {"kind": _USUAL} | dict(table) if isinstance(table, Mapping) else table),
 ]
 

@@ -10,7 +10,7 @@ from jaxbl.validation import suggest_word, table_error
 
 from .experiment import ExcitationTable
 from .sweep import AxisTable
-from .tables import Table, declare_key
+from .tables import Table, check_distinct, declare_key
 
 
 class _SpanTable(Table):
@@ -186,9 +186,7 @@ class TuneTable(Table):
         ]
         in_loop = self.objective in LOOP_OBJECTIVES
         paths = [gain.path for gain in self.gains]
-        for i, path in enumerate(paths):
-            if path in paths[:i]:
-                raise table_error(f"gains[{i}].path: '{path}' is listed already; each gain may be listed once")
+        check_distinct(paths, "gains[{i}].path: '{value}' is listed already; each gain may be listed once")
         for key in ("gains", "longest_settling", "largest_limit_cycle"):
             if key in changed and not in_loop:
                 raise table_error(f"{key} needs an objective of the loop: {', '.join(LOOP_OBJECTIVES)}")
@@ -198,11 +196,10 @@ class TuneTable(Table):
                     raise table_error(f"{key} needs observers, the kinds to choose from; add them, or leave {key} out")
         if not self.observers and not in_loop:
             return
+        check_distinct(self.observers, "observers[{i}]: '{value}' is listed already; each kind may be listed once")
         for i, kind in enumerate(self.observers):
             if kind not in OBSERVERS:
                 raise table_error(f"observers[{i}]: unknown kind '{kind}'; {suggest_word(kind, OBSERVERS)}")
-            if kind in self.observers[:i]:
-                raise table_error(f"observers[{i}]: '{kind}' is listed already; each kind may be listed once")
         keys = "margin_exact", "margin_alpha", "alpha_ratio", "lambda_ratio", "num", "compare", "certificate"
         for key in (*keys, "observers", "longest_convergence") if in_loop else keys:
             if key in changed:

@@ -3,7 +3,7 @@
 import copy
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxbl.json_types import JsonObject
 from jaxbl.records import NominalDrive
 from jaxbl.records.reader import read_log_table
 from jaxbl.records.table import LogTable
-from jaxbl.validation import Key, abbreviate, check_file, check_sizes, explain_first_error, explain_missing_file
+from jaxbl.validation import abbreviate, check_file, check_sizes, explain_first_error, explain_missing_file
 
 from .study import Config, numeric_paths, suggest_path
 
@@ -46,8 +46,10 @@ def read_config(source: ConfigSource) -> Config:
 _MISSING_GAINS = {"lambda": 1.0, "alpha": 1.0}
 
 
-def read_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
+def read_model(source: ConfigSource, *, may_be_element: bool = False) -> tuple[Config, frozenset[str]]:
     """Read a study that is to be held against a log: `[excitation]` and the observers' gains may be missing.
+
+    `may_be_element`: the log may be that of a transmission alone.
 
     Returns:
         The study, with something harmless in place of what is missing; and what is: `excitation`, `observer.motor`,
@@ -56,24 +58,13 @@ def read_model(source: ConfigSource) -> tuple[Config, frozenset[str]]:
     Raises:
         InputError: as :func:`read_config`.
     """
-    name, config, missing = _read_model_of_any_log(source)
-    if config.log.kind == "element":
-        raise InputError(_ELEMENT.format(name))
-    return config, missing
-
-
-_ELEMENT = (
-    "{}: log.kind: 'element' is a transmission alone, without the drive whose motion diagnose explains; jaxbl identify "
-    "finds its stiffness, gap and friction (from Python: identify_element)"
-)
-
-
-def _read_model_of_any_log(source: ConfigSource) -> tuple[str, Config, frozenset[str]]:
-    """Read a model as :func:`read_model` does, for any kind of log. Returns its name for messages, too."""
     name, data, layers = _read_with_includes(source)
     log = data.get("log")
-    if isinstance(log, dict) and log.get("kind") == "element" and "drive" not in data:
-        raise InputError(_ELEMENT.format(name))
+    if isinstance(log, dict) and log.get("kind") == "element" and not (may_be_element and "drive" in data):
+        raise InputError(
+            f"{name}: log.kind: 'element' is a transmission alone, without the drive whose motion diagnose explains; jaxbl "
+            "identify finds its stiffness, gap and friction (from Python: identify_element)"
+        )
     missing = set()
     if "excitation" not in data:
         missing.add("excitation")
@@ -90,7 +81,7 @@ def _read_model_of_any_log(source: ConfigSource) -> tuple[str, Config, frozenset
             f"{name}: drive.kind: logs are held against drives of kind two_inertia or rigid, not {kind}; simulate, sweep, "
             "tune and export take it"
         )
-    return name, config, frozenset(missing)
+    return config, frozenset(missing)
 
 
 def _read_with_includes(source: ConfigSource) -> tuple[str, JsonObject, Layers]:
@@ -122,7 +113,7 @@ def read_log_config(path: Path) -> tuple[LogTable, float | None, NominalDrive | 
     data = _file(path, [], [])
     if set(data) <= {"title", "notes", "log"}:
         return read_log_table(data.get("log"), str(path)), None, None
-    _, config, _ = _read_model_of_any_log(path)
+    config, _ = read_model(path, may_be_element=True)
     ratio = getattr(config.drive, "gear_ratio", None)
     return config.log, ratio, config.nominal_drive()
 
@@ -151,20 +142,21 @@ def _load(path: Path) -> JsonObject:
         check_sizes(data)
         return data
     except FileNotFoundError:
-        raise InputError(f"{path}: {explain_missing_file(path, ['.toml'])}") from None
+        fault = explain_missing_file(path, [".toml"])
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; a TOML file is needed") from None
+        fault = "is a folder; a TOML file is needed"
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is not text in UTF-8; a TOML file is needed") from None
+        fault = "is not text in UTF-8; a TOML file is needed"
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; mend the access to it") from None
+        fault = f"cannot be read: {error.strerror}; mend the access to it"
     except RecursionError:
-        raise InputError(f"{path}: tables or arrays are nested too deep; a study needs five within one another") from None
+        fault = "tables or arrays are nested too deep; a study needs five within one another"
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        fault = str(error)
     # numbers of thousands of digits are a ValueError of another kind
     except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+        fault = f"not valid TOML: {error}"
+    raise InputError(f"{path}: {fault}")
 
 
 def _merge_includes(data: JsonObject, name: str, folder: Path, chain: list[Path], layers: Layers) -> JsonObject:
@@ -212,40 +204,25 @@ def _validate(name: str, data: JsonObject, layers: Layers) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        key, text = _describe(error)
+        first = error.errors()[0]
+        location = _hold(first["loc"], data)
+        if first["type"] == "missing":
+            location.append(first["loc"][-1])
+        key, text = explain_first_error(error, location)
         # the file that the key, or as much of it as there is, came from
-        held = _count_held(key, data)
-        name = next((file for file, layer in reversed(layers) if _count_held(key[:held], layer) == held), name)
+        held = _hold(key, data)
+        name = next((file for file, layer in reversed(layers) if _hold(held, layer) == held), name)
         raise InputError(f"{name}: {text}" if name else text) from None
 
 
-def _count_held(key: Key, table: Any) -> int:
-    """Count the parts of a key, from the first on, that a table holds."""
-    for count, part in enumerate(key):
-        if not isinstance(table, Mapping) or part not in table:
-            return count
-        table = table[part]
-    return len(key)
-
-
-_UNIONS = {(key,): 1 for key in ("drive", "transmission", "excitation", "observer", "controller", "reference")} | {
-    ("effects",): 2,
-    ("tune", "holdout"): 2,
-}
-"""Unions, and how far into a location pydantic puts the tag of their member."""
-
-
-def _describe(error: ValidationError) -> tuple[Key, str]:
-    """The first error: the key that is wrong, and one line that says so."""
-    location = list(error.errors()[0]["loc"])
-    for union, tag in _UNIONS.items():
-        if tuple(location[: len(union)]) == union and len(location) > tag:
-            del location[tag]
-    if location[:1] == ["axes"] and "values" in location:
-        del location[4:]  # the member of the union that came last
-    if location[:1] == ["figures"] and "where" in location:
-        del location[4:]
-    return explain_first_error(error, location)
+def _hold(key: Sequence[str | int], table: Any) -> list[str | int]:
+    """The parts of a key that a table holds, one within the other; of pydantic's keys, not the names of unions' members."""
+    held = []
+    for part in key:
+        if part in table if isinstance(table, Mapping) else isinstance(part, int):
+            held.append(part)
+            table = table[part]
+    return held
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
@@ -259,14 +236,13 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     for path, value in values.items():
         if path not in paths:
             raise InputError(f"unknown path '{path}'; {suggest_path(path, paths)}")
-        section, *keys = path.split(".")
-        if section == "effects":
+        if path.startswith("effects."):
             kind, _, key = path.removeprefix("effects.").rpartition(".")
             kinds = [effect.kind for effect in config.effects]
             target = data["effects"][int(kind) if kind.isdigit() else kinds.index(kind)]
         else:
-            *tables, key = keys
-            target = data.setdefault(section, {})
+            *tables, key = path.split(".")
+            target = data
             for table in tables:
                 target = target.setdefault(table, {})
         if type(target.get(key)) is int and isinstance(value, float) and value.is_integer():

@@ -20,7 +20,7 @@ from jaxbl.chain import Experiment, Run
 from jaxbl.drive import DRIVES, AbstractDrive
 from jaxbl.drive.effects import EFFECTS
 from jaxbl.drive.excitation import EXCITATIONS
-from jaxbl.drive.parameters import Parameter, as_arrays, config_key, parameters
+from jaxbl.drive.parameters import Parameter, as_arrays, parameters
 from jaxbl.errors import InputError
 from jaxbl.observer import OBSERVERS
 from jaxbl.records import NominalDrive
@@ -122,6 +122,13 @@ class Config(Table):
         """Paths of the axes, in their order."""
         return [axis.path for axis in self.axes]
 
+    def parts(self) -> dict[str, Table]:
+        """The tables of what this study's experiment consists of beside effects, by name."""
+        names = ("drive", "transmission", "initial", "excitation", "encoders", "observer", "equivalent_control",
+                 "identifier", "run", "controller", "reference")  # fmt: skip
+        tables = {name: getattr(self, name) for name in names if name != "identifier" or self.is_geared}
+        return {name: table for name, table in tables.items() if table is not None}
+
     def build(self) -> Experiment:
         """Build the experiment that the config describes, with Python numbers as leaves.
 
@@ -138,15 +145,8 @@ class Config(Table):
                     f"{table.file}: ends after {table.length:g} s, and the run only after {run.duration:g} s; "
                     f"run.duration should be at most {table.length:g}"
                 )
-        names = "drive", "initial", "excitation", "encoders", "observer", "equivalent_control", "run"
-        return Experiment(
-            **{name: getattr(self, name).build() for name in names},
-            transmission=None if self.transmission is None else self.transmission.build(),
-            effects=tuple(effect.build() for effect in self.effects),
-            identifier=self.identifier.build() if self.is_geared else None,
-            controller=None if self.controller is None else self.controller.build(),
-            reference=None if self.reference is None else self.reference.build(),
-        )
+        effects = tuple(effect.build() for effect in self.effects)
+        return Experiment(effects=effects, **{name: table.build() for name, table in self.parts().items()})
 
     def nominal_drive(self) -> NominalDrive:
         """Return the nominal numbers that a log of the drive is checked against."""
@@ -180,28 +180,26 @@ _MOST_SUBSTEPS = next(parameter.maximum for field, parameter in parameters(Run) 
 def _check_sides(config: Config) -> None:
     """Require a law where two sides are connected by one, an observer of each side, and steps that resolve the gear."""
     kind, cls, rigid = config.drive.kind, DRIVES[config.drive.kind], "load" not in config.sides
+    tune = config.tune or TuneTable()
     if config.transmission is not None and "load" not in (*cls.sides, *cls.hidden):
         raise table_error(f"[transmission] has no meaning on a {kind} drive; remove it, or use drive.kind = 'two_inertia'")
     if config.transmission is None and not rigid and cls.body_torques is AbstractDrive.body_torques:
         raise table_error(f"[transmission] is missing: a {kind} drive needs one, such as law = 'dead_zone'")
-    compared_tables = () if config.tune is None else config.tune.compare
-    gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(compared_tables)}
+    gains = {"observer": config.observer} | {f"tune.compare[{i}]": other for i, other in enumerate(tune.compare)}
     for name, table in gains.items():
         with_table = {"motor", *(table.model_extra or {})} | (set() if table.load is None else {"load"})
         for side in sorted(with_table - {*config.sides}):
             raise table_error(f"{name}.{side} has no meaning on a {kind} drive; remove it")
         for side in sorted({*config.sides} - with_table):
             raise table_error(f"{name}.{side} is missing: a {kind} drive has a {side} observer; give its lambda and alpha")
-    if rigid and config.controller is not None and config.controller.side == "load":
-        raise table_error(f"controller.side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
+    marks = {f"verify.marks[{i}]": mark for i, mark in enumerate(config.verify.marks)}
+    for name, table in ({"controller": config.controller} | marks).items():
+        if rigid and getattr(table, "side", "") == "load":
+            raise table_error(f"{name}.side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
     if rigid and getattr(config.controller, "gap_from", None) == "twist":
         raise table_error(f"controller.gap_from: a {kind} drive has no twist; it should be 'reference'")
-    certificate = None if config.tune is None else config.tune.certificate
-    if rigid and certificate is not None and certificate.load is not None:
+    if rigid and tune.certificate is not None and tune.certificate.load is not None:
         raise table_error(f"tune.certificate.load has no meaning on a {kind} drive; remove it")
-    for i, mark in enumerate(config.verify.marks):
-        if rigid and mark.side == "load":
-            raise table_error(f"verify.marks[{i}].side: 'load' has no meaning on a {kind} drive; it should be 'motor'")
     if config.transmission is not None:
         drive, rate = config.drive.build(), config.transmission.build().stiffness
         rate *= 1.0 / drive.inertia("motor") + drive.ratio("load") ** 2 / drive.inertia("load")
@@ -236,54 +234,42 @@ def _check_effects(config: Config) -> None:
             raise table_error(f"effects[{i}]: {effect.kind}: {fault}")
     for side in drive.bodies:
         nominal = drive.inertia(side)
-        heavier = [effect for effect in config.effects if effect.kind.startswith(f"{side}.")]
-        added = [float(effect.build().added_inertia()) for effect in heavier]
-        if (total := nominal + sum(added)) <= 0.0:
-            kind = next(effect.kind for effect, inertia in zip(heavier, added, strict=True) if inertia < 0.0)
+        effects = [effect for effect in config.effects if effect.kind.startswith(f"{side}.")]
+        added = [(float(effect.build().added_inertia()), effect.kind) for effect in effects]
+        if (total := nominal + sum(inertia for inertia, _ in added)) <= 0.0:
             raise table_error(
-                f"effects: {kind} leaves a total inertia of {total:g} on the {side}; it should stay above -{nominal:g}"
+                f"effects: {min(added)[1]} leaves a total inertia of {total:g} on the {side}; "
+                f"it should stay above -{nominal:g}"
             )
 
 
 def _check_input(config: Config) -> None:
     """The samples of an input have to show it."""
-    period, holdout = config.run.sample_period, None if config.tune is None else config.tune.holdout
-    for key, table in (("excitation", config.excitation), ("tune.holdout", holdout)):
-        if table is not None and (fault := EXCITATIONS[table.kind].find_fault(dict(table), period)):
+    for key, table in (("excitation", config.excitation), ("tune.holdout", (config.tune or TuneTable()).holdout)):
+        if table is not None and (fault := EXCITATIONS[table.kind].find_fault(dict(table), config.run.sample_period)):
             raise table_error(f"{key}: {fault}")
 
 
 def numeric_paths(config: Config) -> dict[str, Parameter]:
     """Return all paths that an axis may vary in this config, with unit and description."""
     parameters_by_path: dict[str, Parameter] = {}
-    for section in ("drive", "transmission", "initial", "excitation", "encoders", "observer", "equivalent_control",
-                    "identifier", "run", "controller", "reference"):  # fmt: skip
-        table = getattr(config, section)
-        if table is not None:
-            parameters_by_path |= dict(_paths(table, section))
+    for name, table in config.parts().items():
+        parameters_by_path |= dict(_paths(table, name))
     parameters_by_path[KIND_PATH] = Parameter("", "kind of observer")
-    for path in _paths_of_other_observers(config):
-        parameters_by_path.pop(path, None)
+    if config.observer.observer is OBSERVERS[config.observer.kind]:
+        # there is one discretisation
+        del parameters_by_path["observer.discretisation"]
+    if "load" not in config.sides:
+        parameters_by_path = {
+            path: parameter
+            for path, parameter in parameters_by_path.items()
+            if "load" not in path or path.startswith("drive.")
+        }
     kinds = [effect.kind for effect in config.effects]
     for i, effect in enumerate(config.effects):
         label = effect.kind if kinds.count(effect.kind) == 1 else str(i)
         parameters_by_path |= dict(_paths(effect, f"effects.{label}"))
-    return {
-        path: parameter
-        for path, parameter in parameters_by_path.items()
-        if path.startswith(("effects.", "drive."))
-        or (("load" in config.sides or "load" not in path) and (config.is_geared or not path.startswith("identifier.")))
-    }
-
-
-def _paths_of_other_observers(config: Config) -> Iterator[str]:
-    """Paths of observers that say nothing of the study's own kind: its sides may hold gains of others."""
-    observer = config.observer.observer
-    if observer is OBSERVERS[config.observer.kind]:
-        yield "observer.discretisation"
-    gains = {config_key(field.name) for field, _ in parameters(observer)}
-    other_gains = {config_key(field.name) for cls in OBSERVERS.values() for field, _ in parameters(cls)} - gains
-    yield from (f"observer.{side}.{key}" for side in config.sides for key in other_gains)
+    return parameters_by_path
 
 
 KIND_PATH = "observer.kind"
@@ -294,15 +280,17 @@ _FIXED = ("kind", "law", "file", "time_column", "torque_column", "position_colum
 
 def _paths(table: Table, prefix: str) -> Iterator[tuple[str, Parameter]]:
     for side, gains in (table.model_extra or {}).items():
-        yield from _paths(gains, f"{prefix}.{side}")
+        # gains of other kinds of observers are no numbers of this study
+        if isinstance(gains, Table):
+            yield from _paths(gains, f"{prefix}.{side}")
     for name, field in type(table).model_fields.items():
         value = getattr(table, name)
         path = f"{prefix}.{field.alias or name}"
         if isinstance(value, Table):
             yield from _paths(value, path)
         elif name not in _FIXED and not isinstance(value, (list, bool)):
-            extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-            yield path, Parameter(str(extra.get("unit", "")), field.description or "")
+            extra: Any = field.json_schema_extra
+            yield path, Parameter(extra["unit"], field.description or "")
 
 
 def suggest_path(path: str, paths: Mapping[str, Parameter]) -> str:

@@ -7,7 +7,7 @@ from pydantic import model_validator
 
 from jaxbl.validation import table_error
 
-from .tables import Table, declare_key
+from .tables import Table, check_distinct, declare_key
 
 DEFAULT_TOLERANCE = 0.1
 """Relative difference of a numeric metric beyond which neighbours disagree, unless the study says otherwise."""
@@ -61,10 +61,7 @@ class SweepTable(Table):
             raise table_error("refine_tolerance needs a numeric refine_metric, e.g. 'motor.velocity_rmse'")
         if self.metrics is not None and not self.metrics:
             raise table_error("metrics should name at least one, e.g. 'converged'; leave it out for all")
-        names = self.metrics or []
-        for name in names:
-            if names.count(name) > 1:
-                raise table_error(f"metrics names '{name}' twice; once is enough")
+        check_distinct(self.metrics or [], "metrics names '{value}' twice; once is enough")
         if self.refine is not None and self.design != "grid":
             raise table_error(f"refine needs design = 'grid'; points of a {self.design} design have no neighbours")
         return self
@@ -154,9 +151,8 @@ class FigureTable(Table):
             if getattr(self, key) is not None:
                 raise table_error(f"a {self.kind} has no {key}; {hint}")
         paths = [path for path in (self.x, self.y, self.facet, self.series) if path is not None]
+        check_distinct(paths, "{value} is used twice; x, y, facet and series should be different axes")
         for path in paths:
-            if paths.count(path) > 1:
-                raise table_error(f"{path} is used twice; x, y, facet and series should be different axes")
             if path in (self.where or {}):
                 raise table_error(f"{path} is drawn and cannot be fixed by where; leave it out of one of them")
         observer = self.x.rpartition(".")[0]

@@ -5,13 +5,13 @@ A key, its unit and its range are so written once, in the module.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 
 from pydantic import Field, TypeAdapter, WrapValidator, create_model
 
 from jaxbl.drive.parameters import config_key, parameters
-from jaxbl.validation import Positive, StrictTable
+from jaxbl.validation import Positive, StrictTable, table_error
 
 
 class Table(StrictTable):
@@ -42,7 +42,14 @@ def declare_key(doc: str, default: Any = ..., *, unit: str = "", **rules: Any) -
         unit: SI unit; "" if it has none.
         **rules: those of pydantic's `Field`: `gt`, `ge`, `le`, `max_length`, `alias`, ...
     """
-    return Field(default, description=doc, json_schema_extra={"unit": unit} if unit else None, **rules)
+    return Field(default, description=doc, json_schema_extra={"unit": unit}, **rules)
+
+
+def check_distinct(values: Sequence[Any], message: str) -> None:
+    """Refuse a value that is listed twice by a `message` with its position `{i}` and the `{value}`."""
+    for i, value in enumerate(values):
+        if value in values[:i]:
+            raise table_error(message.format(i=i, value=value))
 
 
 def table_for(module: type, factory: Callable[..., Any] | None = None, base: type[Table] = Table, **tag: str) -> type[Table]:
@@ -56,14 +63,13 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
         # lists of numbers are empty by default
         number = Positive if parameter.above == 0.0 else float
         kind: Any = field.type if field.metadata.get("static") else list[float] if field.default == () else number
-        optional = field.default is None
         fields[field.name] = (
-            kind | None if optional else kind,
+            kind | None if field.default is None else kind,
             declare_key(
                 parameter.doc,
                 ... if field.default is dataclasses.MISSING else [] if field.default == () else field.default,
                 unit=parameter.unit,
-                alias=config_key(field.name) if config_key(field.name) != field.name else None,
+                alias=config_key(field.name),
                 ge=parameter.minimum,
                 gt=parameter.above,
                 le=parameter.maximum,
@@ -74,7 +80,11 @@ def table_for(module: type, factory: Callable[..., Any] | None = None, base: typ
     return model
 
 
-def tagged_union(members: Mapping[str, type], make_table: Callable[[str, type], type[Table]], key: str) -> Any:
+def tagged_union(
+    members: Mapping[str, type],
+    make_table: Callable[[str, type], type[Table]] = lambda kind, cls: table_for(cls, kind=kind),
+    key: str = "kind",
+) -> Any:
     """The type of a table that is one of several, told apart by the value of a key (`kind`, `law`).
 
     Members that are registered later (:func:`jaxbl.register`) are taken as well.
