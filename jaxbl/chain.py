@@ -191,9 +191,9 @@ def initial_state(experiment: Experiment, measured: dict[str, Number] | None = N
     """Return the state at t = 0; with `measured` positions (rad), the state of a replay that begins there, at standstill."""
     zero = jnp.zeros_like(jnp.asarray(experiment.run.sample_period))
     zeros = dict.fromkeys(experiment.sides, zero)
-    plant = experiment.plant.init(experiment.initial) if measured is None else None
-    position, velocity = measured or {}, zeros
-    if plant is not None:
+    plant, position, velocity = None, measured, zeros
+    if position is None:
+        plant = experiment.plant.init(experiment.initial)
         velocity = plant.velocity
         position = {side: experiment.plant.read(side, plant.position[side], velocity[side]) for side in experiment.sides}
     observer_states = {}

@@ -251,10 +251,22 @@ class Plant(eqx.Module):
         states = self.advance_effects(states, state.position, state.velocity, time, 0.5 * step)
         middle = {side: state.position[side] + 0.5 * step * state.velocity[side] for side in self.drive.bodies}
         middle_time = time + 0.5 * step
-        velocity = self._kick(state.velocity, middle, state.velocity, states, torque, middle_time, step)
+
+        def kick(effect_velocity: SideValues) -> SideValues:
+            """Velocities after the step, with effects at `effect_velocity` (rad/s)."""
+            new_velocity = {}
+            for side, (total, level) in self.side_torques(middle, effect_velocity, states, torque, middle_time).items():
+                mass = self.inertia(side) / step
+                drag = 0.5 * self.drive.viscous(side)
+                free = ((mass - drag) * state.velocity[side] + total) / (mass + drag)
+                if not isinstance(level, float):
+                    free = _apply_dry_friction(state.velocity[side], free, level / (mass + drag))
+                new_velocity[side] = free
+            return new_velocity
+
+        velocity = kick(state.velocity)
         if any(effect.velocity_dependent for effect in self.effects):
-            mean = {side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.bodies}
-            velocity = self._kick(state.velocity, middle, mean, states, torque, middle_time, step)
+            velocity = kick({side: 0.5 * (state.velocity[side] + velocity[side]) for side in self.drive.bodies})
         position = {side: middle[side] + 0.5 * step * velocity[side] for side in self.drive.bodies}
         return PlantState(position, velocity, self.advance_effects(states, middle, velocity, middle_time, 0.5 * step))
 
@@ -379,27 +391,6 @@ class Plant(eqx.Module):
             if type(effect).holds is not AbstractEffect.holds:
                 torque, level = torque + effect.resist(state, motion), level + effect.holds()
         return torque, level
-
-    def _kick(
-        self,
-        velocity: SideValues,
-        position: SideValues,
-        effect_velocity: SideValues,
-        states: EffectStates,
-        torque: Scalar,
-        time: Scalar,
-        step: Scalar,
-    ) -> SideValues:
-        """Velocities after a step of `step` seconds; effects are evaluated at `effect_velocity` (rad/s)."""
-        new_velocity = {}
-        for side, (total, level) in self.side_torques(position, effect_velocity, states, torque, time).items():
-            mass = self.inertia(side) / step
-            drag = 0.5 * self.drive.viscous(side)
-            free = ((mass - drag) * velocity[side] + total) / (mass + drag)
-            if not isinstance(level, float):
-                free = _apply_dry_friction(velocity[side], free, level / (mass + drag))
-            new_velocity[side] = free
-        return new_velocity
 
     def _effects_at(self, place: str, states: EffectStates) -> list[tuple[AbstractEffect, Any]]:
         """The effects that act at a place, each with its state."""

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from jaxbl.registry import Registry, check_module
 
-from .parameters import Scalar, ScalarArray, parameter
+from .parameters import Scalar, ScalarArray, parameter, parameters
 
 
 class AbstractTransmission(eqx.Module):
@@ -54,9 +54,9 @@ class AbstractTransmission(eqx.Module):
     def from_theta(self, theta: tuple[ScalarArray, ...]) -> dict[str, ScalarArray]:
         """Convert regression coefficients theta into the numbers of :meth:`truth`."""
 
-    @abc.abstractmethod
     def truth(self) -> dict[str, Scalar]:
-        """Parameters of this law by name, and further numbers that are identified."""
+        """Numbers that are identified, by name: those that the law declares, unless overridden."""
+        return {field.name: getattr(self, field.name) for field, _ in parameters(self)}
 
 
 TRANSMISSIONS = Registry("jaxbl.transmissions", partial(check_module, base=AbstractTransmission))
@@ -115,9 +115,6 @@ class LinearShaft(AbstractTransmission):
     def from_theta(self, theta):
         return {"stiffness": theta[0]}
 
-    def truth(self):
-        return {"stiffness": self.stiffness}
-
 
 @TRANSMISSIONS.add
 class DeadZone(AbstractTransmission):
@@ -145,6 +142,3 @@ class DeadZone(AbstractTransmission):
     def from_theta(self, theta):
         stiffness, product = theta
         return {"stiffness": stiffness, "half_gap": product / stiffness}
-
-    def truth(self):
-        return {"stiffness": self.stiffness, "half_gap": self.half_gap}

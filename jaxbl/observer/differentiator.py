@@ -18,6 +18,8 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from numpy.polynomial.polynomial import polyfromroots
 
 from jaxbl.drive.parameters import Scalar, parameter
 
@@ -100,26 +102,20 @@ def solve_correction(coefficients: Sequence[float], beyond: Any) -> Any:
     return rho
 
 
-def _stirling_numbers(n: int) -> list[int]:
-    """Coefficients of x (x + 1) ... (x + n - 1), lowest power first."""
-    row = [1]
-    for k in range(n):
-        row = [k * a + b for a, b in zip([*row, 0], [0, *row], strict=True)]
-    return row
-
-
 def _correction_weights(order: int) -> list[list[float]]:
     """Weights w[i][j], i <= j, with which the correction of state j is added to state i, in units of h^(j - i + 1).
 
     They are (i!/j!) [j + 1, i + 1] with Stirling numbers of the first kind, where state 0 is the position. With these
     weights, and no others, the states in the sliding set are derivatives of the polynomial through the last n + 1 samples.
     """
-    weights = [[0.0] * (order + 1) for _ in range(order + 1)]
-    for j in range(1, order + 2):
-        row = _stirling_numbers(j)
-        for i in range(1, j + 1):
-            weights[i - 1][j - 1] = factorial(i - 1) * row[i] / factorial(j - 1)
-    return weights
+    weights = np.zeros((order + 1, order + 1))
+    for j in range(order + 1):
+        # coefficients of x (x + 1) ... (x + j), lowest power first
+        stirling_numbers = polyfromroots(-np.arange(j + 1))
+        for i in range(j + 1):
+            weights[i, j] = factorial(i) * stirling_numbers[i + 1] / factorial(j)
+    # Python's numbers leave the precision to JAX's arrays
+    return weights.tolist()
 
 
 class AbstractDifferentiator(AbstractObserver):
@@ -131,6 +127,7 @@ class AbstractDifferentiator(AbstractObserver):
 
     In the sliding set, |b| <= h^(n+1) k_(n+1) L, e is zero, and the states are derivatives of the polynomial through the
     last n + 1 samples. As k_(n+1) > 1, a signal without noise whose (n+1)-th derivative stays below L never leaves it again.
+    With n = 1 it is the implicit super-twisting observer with lambda = k_1 sqrt(L) and alpha = k_2 L.
 
     Attributes:
         order: n.
@@ -152,6 +149,10 @@ class AbstractDifferentiator(AbstractObserver):
 
     def step(self, state, measured, acceleration, period):
         n, coefficients = self.order, COEFFICIENTS[self.order]
+        if n == 1:
+            first, second = coefficients
+            observer = ImplicitSuperTwisting(lambda_=first * jnp.sqrt(self.lipschitz), alpha=second * self.lipschitz)
+            return observer.step(state, measured, acceleration, period)
         periods = _powers(period, n + 1)
         unit = periods[n + 1] * self.lipschitz
         innovation = measured - state.position
@@ -190,20 +191,9 @@ def _predict_taylor(
     return ObserverState(new_position, new_velocity, tuple(series))
 
 
-class _FirstOrder(AbstractDifferentiator):
-    """Differentiator of order 1: the implicit super-twisting observer with lambda = k_1 sqrt(L) and alpha = k_2 L."""
-
-    def step(self, state, measured, acceleration, period):
-        first, second = COEFFICIENTS[1]
-        observer = ImplicitSuperTwisting(lambda_=first * jnp.sqrt(self.lipschitz), alpha=second * self.lipschitz)
-        return observer.step(state, measured, acceleration, period)
-
-
 def _make_differentiator(n: int, unit: str) -> type[AbstractDifferentiator]:
-    base: Any = _FirstOrder if n == 1 else AbstractDifferentiator
-
     @OBSERVERS.add
-    class Differentiator(base):
+    class Differentiator(AbstractDifferentiator):
         __doc__ = AbstractDifferentiator.__doc__
         name = f"differentiator_{n}"
         order = n

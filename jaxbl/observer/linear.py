@@ -5,10 +5,12 @@ fixed shares L of the innovation: x_hat = x_predicted + L (y - x_predicted). The
 """
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbl.drive.parameters import Scalar, parameter
 
@@ -162,7 +164,7 @@ class Kalman(AbstractLinearObserver):
             return [new_position - still[0], (new_velocity - still[1]) * period, disturbance]
 
         unit = zero + 1.0
-        transposed = [[unit, zero, zero], transition_column(unit, zero), transition_column(zero, unit)]
+        transposed = _matrix([[unit, zero, zero], transition_column(unit, zero), transition_column(zero, unit)])
         noise = self.position_noise
         slow = (self.disturbance_noise / noise) ** 2 * period**5
         fast = (self.acceleration_noise / noise) ** 2 * period**3
@@ -172,13 +174,21 @@ class Kalman(AbstractLinearObserver):
             [slow / 8.0 + fast / 2.0, slow / 3.0 + fast, slow / 2.0],
             [slow / 6.0, slow / 2.0, slow],
         ]
-        p = _solve_riccati(transposed, q)
-        total = p[0][0] + 1.0
-        return Correction(p[0][0] / total, p[1][0] / (total * period), p[2][0] / (total * period * period))
+        variance, covariance, disturbance = _solve_riccati(transposed, _matrix(q))[:, 0]
+        total = variance + 1.0
+        return Correction(variance / total, covariance / (total * period), disturbance / (total * period * period))
 
 
-Matrix = list[list[Any]]
-"""Three rows of three numbers, since compiled loops over lanes have no arrays."""
+Matrix = np.ndarray
+"""Three rows of three numbers of JAX, as objects: compiled loops over lanes have no arrays."""
+
+
+def _matrix(rows: Sequence[Sequence[Any]]) -> Matrix:
+    matrix = np.empty((3, 3), object)
+    for i, j in np.ndindex(3, 3):
+        matrix[i, j] = rows[i][j]
+    return matrix
+
 
 _DOUBLINGS = 32
 """Doublings, for 2^32 samples: every useful filter is stationary by then."""
@@ -194,42 +204,27 @@ def _solve_riccati(transposed: Matrix, q: Matrix) -> Matrix:
         transposed: the transpose a' of the transition matrix.
         q: covariance of the process noise over a period.
     """
-    zero = 0.0 * q[0][0]
-    g = _unit_diagonal(zero, 1)
+    zero = 0.0 * q[0, 0]
 
-    def double(_: Any, carry: tuple[Matrix, Matrix, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
+    def double(_: Any, carry: list[list[list[Any]]]) -> list[list[list[Any]]]:
         # b is the transposed transition over 2^k samples
-        b, g, p = carry
-        inverse = _invert(_add(_unit_diagonal(zero, 3), _multiply(g, p)))
-        b_transposed, b_inverse = _transpose(b), _multiply(b, inverse)
-        return (
-            _multiply(b_inverse, b),
-            _symmetrise(_add(g, _multiply(_multiply(b_inverse, g), b_transposed))),
-            _symmetrise(_add(p, _multiply(_multiply(_multiply(b_transposed, p), inverse), b))),
-        )
+        b, g, p = map(_matrix, carry)
+        inverse = _invert(_unit_diagonal(zero, 3) + g @ p)
+        b_inverse = b @ inverse
+        new = b_inverse @ b, _symmetrise(g + b_inverse @ g @ b.T), _symmetrise(p + b.T @ p @ inverse @ b)
+        return [matrix.tolist() for matrix in new]
 
-    return jax.lax.fori_loop(0, _DOUBLINGS, double, (transposed, g, q))[2]
+    start = [matrix.tolist() for matrix in (transposed, _unit_diagonal(zero, 1), q)]
+    return _matrix(jax.lax.fori_loop(0, _DOUBLINGS, double, start)[2])
 
 
 def _unit_diagonal(zero: Any, size: int) -> Matrix:
-    return [[zero + float(i == j < size) for j in range(3)] for i in range(3)]
-
-
-def _multiply(a: Matrix, b: Matrix) -> Matrix:
-    return [[sum((a[i][k] * b[k][j] for k in range(1, 3)), a[i][0] * b[0][j]) for j in range(3)] for i in range(3)]
-
-
-def _add(a: Matrix, b: Matrix) -> Matrix:
-    return [[x + y for x, y in zip(left, right, strict=True)] for left, right in zip(a, b, strict=True)]
-
-
-def _transpose(a: Matrix) -> Matrix:
-    return [list(row) for row in zip(*a, strict=True)]
+    return _matrix([[zero + float(i == j < size) for j in range(3)] for i in range(3)])
 
 
 def _symmetrise(a: Matrix) -> Matrix:
     """Make a matrix symmetric again; rounding would distort it more with each doubling."""
-    return [[0.5 * (a[i][j] + a[j][i]) for j in range(3)] for i in range(3)]
+    return 0.5 * (a + a.T)
 
 
 def _invert(a: Matrix) -> Matrix:
@@ -237,11 +232,12 @@ def _invert(a: Matrix) -> Matrix:
 
     def cofactor(i: int, j: int) -> Any:
         rows, columns = ([(k + 1) % 3, (k + 2) % 3] for k in (i, j))
-        return a[rows[0]][columns[0]] * a[rows[1]][columns[1]] - a[rows[0]][columns[1]] * a[rows[1]][columns[0]]
+        minor = a[np.ix_(rows, columns)]
+        return minor[0, 0] * minor[1, 1] - minor[0, 1] * minor[1, 0]
 
-    cofactors = [[cofactor(i, j) for j in range(3)] for i in range(3)]
-    determinant = sum((a[0][j] * cofactors[0][j] for j in range(1, 3)), a[0][0] * cofactors[0][0])
-    return [[cofactors[j][i] / determinant for j in range(3)] for i in range(3)]
+    cofactors = _matrix([[cofactor(i, j) for j in range(3)] for i in range(3)])
+    determinant = a[0] @ cofactors[0]
+    return _matrix([[number / determinant for number in column] for column in cofactors.T])
 
 
 @OBSERVERS.add
