@@ -20,10 +20,21 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler and "multiproce
 
 
 def program() -> None:
-    """Entry point: what takes its time to load is loaded under the handler above."""
-    from .cli import program
+    """Entry point: what takes its time to load is loaded under the handler above.
 
-    program()
+    An interrupt ends the process without taking down the interpreter: threads of XLA may still compute then, and would
+    crash when their memory is freed.
+    """
+    from .cli import INTERRUPTED, main
+
+    try:
+        main()
+    except SystemExit as end:
+        if end.code != INTERRUPTED:
+            raise
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -87,12 +87,6 @@ def run_with_progress(
         signal.signal(signal.SIGINT, before)
 
 
-def run_until_interrupted(run: Callable[[], object]) -> None:
-    """Run until Ctrl+C or a request to end; a second one ends the process as it is."""
-    with suppress(KeyboardInterrupt), watch_for_end_request(interrupts=True):
-        run()
-
-
 @contextmanager
 def watch_for_end_request(*, interrupts: bool = False) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True once the user or the system has asked the process to end; with `interrupts`, this
@@ -119,14 +113,11 @@ def watch_for_end_request(*, interrupts: bool = False) -> Iterator[Callable[[], 
 
 def repeat_call(context: typer.Context, folder: Path, *, keeps_results: bool = True) -> list[str]:
     """The words of this call, with the folder of its results; what is `keeps_results` there is not to be overwritten."""
-    words = [str(context.info_name)]
+    words, left_out = [str(context.info_name)], ["out"] + ["overwrite"] * keeps_results
     for parameter in context.command.params:
-        source, value = context.get_parameter_source(str(parameter.name)), context.params.get(str(parameter.name))
-        if (
-            parameter.name in ("out", "overwrite" if keeps_results else "out")
-            or source is None
-            or source.name != "COMMANDLINE"
-        ):
+        name = str(parameter.name)
+        source, value = context.get_parameter_source(name), context.params.get(name)
+        if name in left_out or source is None or source.name != "COMMANDLINE":
             continue
         for part in value if isinstance(value, list | tuple) else [value]:
             words += parameter.opts[:1] if parameter.param_type_name == "option" else []

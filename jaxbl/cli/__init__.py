@@ -1,6 +1,5 @@
 """The command line: parse, call, print. JAX is imported only once a command has work for it."""
 
-import os
 import sys
 from collections.abc import Callable
 from itertools import chain
@@ -77,18 +76,3 @@ def main(run: Callable[[], object] = app) -> None:
     except KeyboardInterrupt:
         typer.echo("interrupted", err=True)
         sys.exit(INTERRUPTED)
-
-
-def program() -> None:
-    """Entry point: as :func:`main`, and an interrupt ends the process without taking down the interpreter.
-
-    Threads of XLA may still compute then, and would crash when their memory is freed.
-    """
-    try:
-        main()
-    except SystemExit as end:
-        if end.code != INTERRUPTED:
-            raise
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(INTERRUPTED)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +14,7 @@ from jaxbl import workers
 from jaxbl.errors import InputError, escape_unprintable
 from jaxbl.files import ResultFolder, log_subject, open_results, run_or_read, to_jsonable, write_atomic
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import NextStep
+from jaxbl.lines import NextStep, doubts_among
 from jaxbl.result import KeyFigure
 from jaxbl.terminal import STEPS, is_quiet, repeat_call, run_with_progress, watch_for_end_request
 
@@ -28,7 +29,6 @@ from .options import (
     MaxTravelOption,
     SchedulerOption,
     argument,
-    check_doubts,
     check_new,
     flag,
     folder_of,
@@ -144,8 +144,7 @@ def identify(
 
         check_gap_sought(task)
     log_call = LogCall(log, model, holdout, next_experiment, folder, repeat_call(context, folder))
-    reports = describe, after_identification
-    return _run_task(context, task, log_call, "identification.json", run_identification, *reports)
+    return _run_task(context, task, log_call, "identification.json", run_identification, describe, after_identification)
 
 
 def diagnose(
@@ -217,7 +216,10 @@ def _run_task(
 ) -> Outcome:
     """Search what a log says of a machine, unless that is done, and write the next experiment that is asked for."""
     options, folder, experiment = context.params, log_call.folder, log_call.next_experiment
-    check_doubts(filter(None, (task.record, task.holdout)), options["force"])
+    # a search takes minutes, and its answer would be as doubtful as a unit or a sign of the log
+    for record in filter(None, (task.record, task.holdout)):
+        if not options["force"] and (doubts := doubts_among(record.warnings)):
+            raise InputError(f"{record.path}: {doubts[0]} --force searches all the same")
 
     def answer(summary: JsonObject) -> "Result":
         return replace(describe(summary), next_steps=steps(task, summary, log_call))
@@ -281,33 +283,29 @@ def watch(
 
     task = read_watch_task(source, model, alarm_gap=alarm_gap, window=window, interval=interval, blind=blind, follow=follow)
     folder = out if "://" in source or out is not None else folder_of(Path(source), "watched", None)
-    if folder is None:
-        result = _watch_and_print(context, task, None)
-        card = jaxbl.describe(result)
-    else:
-        with open_results(folder, log_subject(Path(task.name)), overwrite=overwrite) as results:
-            _claim_stream(results, task, overwrite)
-            result = _watch_and_print(context, task, folder)
-            card = replace(jaxbl.describe(result), next_steps=after_watch(task, result.summary, model))
+    with open_results(folder, log_subject(Path(task.name)), overwrite=overwrite) if folder else nullcontext() as results:
+        if results is not None and task.record is None:
+            _claim_stream(results, overwrite)
+        result = _watch_and_print(context, task, folder)
+        card = replace(jaxbl.describe(result), next_steps=after_watch(task, result.summary, model))
+        if results is not None:
             jaxbl.write_report(result, results, card)
     code = ALARM if result.summary["alarm"] else BLIND if result.summary["blind"]["longest"] else 0
     return Outcome(card, folder, summary=result.summary, code=code)
 
 
-def _claim_stream(results: ResultFolder, task: "WatchTask", overwrite: bool) -> None:
+def _claim_stream(results: ResultFolder, overwrite: bool) -> None:
     from jaxbl.report.watch import VALUES
 
-    if task.record is None:
-        if (results.path / VALUES).exists() and not overwrite:
-            raise InputError(f"{results.path}: holds values of another stream; choose another with --out, or --overwrite")
-        # the folder is this stream's before there are values in it
-        results.write_manifest()
+    if (results.path / VALUES).exists() and not overwrite:
+        raise InputError(f"{results.path}: holds values of another stream; choose another with --out, or --overwrite")
+    # the folder is this stream's before there are values in it
+    results.write_manifest()
 
 
 def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | None) -> "Watch":
     """Print values as they come; those of a stream are in the folder at once, as nobody can give them again."""
     import json
-    from contextlib import ExitStack
 
     from jaxbl.monitoring.watch import format_values, run_watch
     from jaxbl.report.watch import open_values
@@ -318,16 +316,15 @@ def _watch_and_print(context: typer.Context, task: "WatchTask", folder: Path | N
         if not quiet:
             typer.echo(escape_unprintable(f"jaxbl: {text}"), err=True)
 
-    with ExitStack() as stack:
-        keep = open_values(folder, task) if folder is not None and task.record is None else None
-        ended = None if task.record is not None else stack.enter_context(watch_for_end_request())
+    keep = open_values(folder, task) if folder is not None and task.record is None else None
 
-        def show(values: JsonObject) -> None:
-            if keep is not None:
-                keep(values)
-            if as_json:
-                typer.echo(json.dumps(to_jsonable(values), ensure_ascii=False))
-            elif not quiet:
-                typer.echo(format_values(values, task))
+    def show(values: JsonObject) -> None:
+        if keep is not None:
+            keep(values)
+        if as_json:
+            typer.echo(json.dumps(to_jsonable(values), ensure_ascii=False))
+        elif not quiet:
+            typer.echo(format_values(values, task))
 
+    with watch_for_end_request() if task.record is None else nullcontext() as ended:
         return run_watch(task, on_values=show, on_remark=remark, ended=ended)

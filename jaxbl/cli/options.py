@@ -1,18 +1,12 @@
 """Arguments and options that several commands have."""
 
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from jaxbl.errors import InputError
 from jaxbl.files import to_path
-from jaxbl.lines import doubts_among
-
-if TYPE_CHECKING:
-    from jaxbl.estimation.logs import SealedRecord
-    from jaxbl.records import Record
 
 
 def argument(metavar: str, text: str, *, show_default: bool | str = False, **rules: Any) -> Any:
@@ -63,13 +57,6 @@ LogOverwriteOption = Annotated[bool, flag("--overwrite", "write into a folder th
 def folder_of(source: Path, result: str, out: str | Path | None) -> Path:
     """Return the folder for one kind of result of a study or a log: no two commands share one unless `out` says so."""
     return to_path(out) if out is not None else Path("results") / f"{source.stem}_{result}"
-
-
-def check_doubts(records: "Iterable[Record | SealedRecord]", force: bool) -> None:
-    """Refuse a search of minutes on a log of which a unit or a sign is doubtful."""
-    for record in records:
-        if not force and (doubts := doubts_among(record.warnings)):
-            raise InputError(f"{record.path}: {doubts[0]} --force searches all the same")
 
 
 def check_new(file: Path, option: str) -> None:

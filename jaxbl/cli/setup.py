@@ -66,17 +66,17 @@ def init(
             f"other kinds: {other_kinds}"
         )
     values = {item.name: item.read(answered[item.name]) for item in items if item.name in answered}
-    if asking:
-        if len(values) < len(items):
-            typer.echo("Numbers of the data sheet with their units; Enter takes what is in brackets.", err=True)
-        values = {item.name: values.get(item.name) or _ask_number(item) for item in items}
-    elif missing := [item for item in items if item.name not in values and not item.default]:
+    if asking and len(values) < len(items):
+        typer.echo("Numbers of the data sheet with their units; Enter takes what is in brackets.", err=True)
+    missing = [item for item in items if item.name not in values and not item.default]
+    if missing and not asking:
         missing_options = ", ".join(f"{item.option} '{item.example}'" for item in missing)
         other = "" if kind else f"; another kind of drive: --kind {', '.join(list(KINDS)[1:])}"
         raise InputError(
             f"init: numbers are missing, here with examples: {missing_options}; on a terminal init asks for them{other}"
         )
-    values = {item.name: values.get(item.name) or item.default_answer() for item in items}
+    answer = _ask_number if asking else Item.default_answer
+    values = {item.name: values.get(item.name) or answer(item) for item in items}
     workers.start_jax()
     with show_task(context, "running a pilot for the gains"):
         text, pilot_metrics = write_first_study(KINDS[name], values, title or file.stem)

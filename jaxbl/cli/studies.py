@@ -22,8 +22,8 @@ from jaxbl.terminal import (
     STEPS,
     is_quiet,
     name_config_in_errors,
-    run_until_interrupted,
     run_with_progress,
+    watch_for_end_request,
 )
 
 from .next_steps import after_comparison, after_run, after_sweep, after_tuning
@@ -374,7 +374,8 @@ def explore(
             # a browser in the terminal ends when it is left
             page = server.write_redirect().as_uri()
             threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
-        run_until_interrupted(server.serve_forever)
+        with suppress(KeyboardInterrupt), watch_for_end_request(interrupts=True):
+            server.serve_forever()
     return Outcome([])
 
 
