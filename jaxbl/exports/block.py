@@ -1,19 +1,19 @@
 """A block to write code for: a state, a step from sample to sample, and names for all inputs and outputs."""
 
+import operator
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import compress
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.fused import Leaves
-from jaxbl.fused.jaxprs import ClosedJaxpr, trace
+from jaxbl.fused.jaxprs import ClosedJaxpr, jaxpr_as_fun
 
 from .lowering import (
-    Choice,
     Constant,
-    Operation,
     Routine,
     Value,
     Variable,
@@ -145,8 +145,8 @@ def trace_block(
             descriptions.update({name: (unit, description) for name, (_, unit, description) in out.items()})
             return new, [value for value, _, _ in out.values()]
 
-        traced_start = trace(start_in_order, [*numbers.values()], [*begin.values()])
-        traced_step = trace(step_in_order, [*numbers.values()], state, [*sample.values()])
+        traced_start = jax.make_jaxpr(start_in_order)([*numbers.values()], [*begin.values()])
+        traced_step = jax.make_jaxpr(step_in_order)([*numbers.values()], state, [*sample.values()])
     dtypes = (np.dtype(aval.dtype) for aval in traced_step.out_avals)
     state_ports = [
         Port(jax.tree_util.keystr(path, simple=True, separator="_"), "", "", next(dtypes))
@@ -206,76 +206,61 @@ _FARTHEST = 2.0**31
 """Steps of a reference beyond which a position is taken for a fault."""
 
 
-def widen_positions(program: Program) -> Program:
-    """Return a program in float whose positions come and go as double, counted from references that move along.
+def widen_positions(block: Block) -> Block:
+    """Return a block in float whose positions come and go as double, counted from references that move along.
 
     At any turn it computes with small numbers then, and finds what it finds near zero.
     """
-    block, double = program.block, np.dtype(float)
     if block.dtype != np.float32:
-        return program
-    names = {name for origin in block.references for name in (*origin.inputs, f"{origin.inputs[0]}_estimate")}
-    ports = {
-        kind: [port._replace(dtype=double) if port.name in names else port for port in getattr(block, kind)]
-        for kind in ("start_inputs", "inputs", "outputs")
+        return block
+    double, references = np.dtype(float), block.references
+    # the place of its reference for each position that is given, carried, or found
+    places = {
+        name: i
+        for i, reference in enumerate(references)
+        for name in (*reference.inputs, *reference.states, f"{reference.inputs[0]}_estimate")
     }
-    origins = [Port(origin.name, "", "", double) for origin in block.references]
-    state, zero = (*program.state, *origins), Constant(np.zeros((), double))
-    start, _ = _count_from_references(program, program.start, [zero] * len(origins), ())
-    step, variables = _count_from_references(program, program.step, _make_variables(origins), program.state_variables)
-    return Program(block._replace(**ports), state, start, step, variables)
 
+    def widen(ports: Sequence[Port]) -> list[Port]:
+        return [port._replace(dtype=double) if port.name in places else port for port in ports]
 
-def _count_from_references(
-    program: Program, routine: Routine, origins: Sequence[Any], states: Sequence[Variable]
-) -> tuple[Routine, tuple[Variable, ...]]:
-    """Return a routine that first moves the references from `origins`, and the variables of all states that it reads."""
-    references, double, flag = program.block.references, np.dtype(float), np.dtype(bool)
-    outer = {name: Variable(double, name) for origin in references for name in origin.inputs}
-    new_states = list(states)
+    def shift(change: Callable[..., Any], ports: Sequence[Port], numbers: Leaves, ways: Leaves, dtype: Any) -> Leaves:
+        """Change the positions among numbers by the ways of their references."""
+        return [
+            change(number.astype(double), ways[places[port.name]]).astype(dtype) if port.name in places else number
+            for port, number in zip(ports, numbers, strict=True)
+        ]
 
-    def add(statements: list[Any], name: str, *operands: Any, out: Variable | None = None, dtype: Any = double) -> Variable:
-        out = out or Variable(dtype)
-        values = (
-            value if isinstance(value, Variable | Constant) else Constant(np.asarray(value, double)) for value in operands
-        )
-        statements.append(Operation(out, name, tuple(values), ""))
-        return out
+    def widen_routine(routine: ClosedJaxpr, ports: Sequence[Port], state_ports: Sequence[Port]) -> ClosedJaxpr:
+        """A routine that first moves the references, or puts them where the positions are if it has no state."""
+        leader = [port.name for port in ports].index(references[0].inputs[0])
 
-    before: list[Any] = []
-    moves: list[Any] = []
-    after: list[Any] = []
-    away = add(before, "sub", outer[references[0].inputs[0]], origins[0])
-    away = add(before, "div", away, references[0].step)
-    size = add(before, "abs", away)
-    far, possible = add(before, "ge", size, 1.0, dtype=flag), add(before, "lt", size, _FARTHEST, dtype=flag)
-    far = add(before, "and", far, possible, dtype=flag)
-    steps = add(moves, "sub", add(moves, "add", away, _WHOLE), _WHOLE)
-    outs: dict[Variable, tuple[Any, Any]] = {}
-    places: dict[str, Variable] = {}
-    for reference, origin in zip(references, origins, strict=True):
-        way, place = add(moves, "mul", steps, reference.step), Variable(double)
-        outs[place] = add(moves, "add", origin, way), origin
-        places |= dict.fromkeys(reference.inputs, place)
-        for i, variable in enumerate(states):
-            if program.state[i].name in reference.states:
-                # the variable becomes a numbered one
-                new_states[i], variable.name = Variable(variable.dtype, variable.name), ""
-                near = add(moves, "sub", add(moves, "convert", new_states[i]), way)
-                outs[variable] = add(moves, "convert", near, dtype=variable.dtype), new_states[i]
-    yes, no = zip(*outs.values(), strict=True)
-    before.append(Choice(far, tuple(outs), (Routine(tuple(moves), yes), Routine((), no)), ""))
-    variables = {variable.name: variable for variable in drop_unread(routine)[1]}
-    # in the order of the block: that of a set is another one in each process
-    for name, place in places.items():
-        if variable := variables.get(name):
-            variable.name = ""
-            add(before, "convert", add(before, "sub", outer[name], place), out=variable)
-    count = len(program.state)
-    outputs = list(routine.results[count:])
-    for i, port in enumerate(program.block.outputs[: len(outputs)]):
-        if (position := port.name.removesuffix("_estimate")) in places and port.name != position:
-            outputs[i] = add(after, "add", places[position], add(after, "convert", outputs[i]))
-    results = *routine.results[:count], *(places[reference.inputs[0]] for reference in references), *outputs
-    full = Routine((*before, *routine.statements, *after), results)
-    return drop_unread(full)[0], (*new_states, *(origin for origin in origins if isinstance(origin, Variable)))
+        def count_from_references(numbers: Leaves, state: Leaves, origins: Leaves, given: Leaves) -> Leaves:
+            origins = origins or [jnp.zeros((), double)] * len(references)
+            steps = (given[leader] - origins[0]) / references[0].step
+
+            def follow(state: Leaves, origins: Leaves) -> tuple[Leaves, Leaves]:
+                whole_steps = (steps + _WHOLE) - _WHOLE
+                ways = [whole_steps * reference.step for reference in references]
+                moved = [origin + way for origin, way in zip(origins, ways, strict=True)]
+                return shift(operator.sub, state_ports, state, ways, block.dtype), moved
+
+            is_far = (jnp.abs(steps) >= 1.0) & (jnp.abs(steps) < _FARTHEST)
+            state, origins = jax.lax.cond(is_far, follow, lambda *unmoved: unmoved, state, origins)
+            near = shift(operator.sub, ports, given, origins, block.dtype)
+            results = jaxpr_as_fun(routine)(*numbers, *state, *near)
+            new, outputs = results[: len(block.state)], results[len(block.state) :]
+            outer = shift(operator.add, block.outputs[: len(outputs)], outputs, origins, double)
+            return [*new, *origins, *outer]
+
+        numbers = [jax.ShapeDtypeStruct((), block.dtype)] * len(block.study_numbers)
+        groups = state_ports, origin_ports if state_ports else (), widen(ports)
+        examples = ([jax.ShapeDtypeStruct((), port.dtype) for port in group] for group in groups)
+        with default_precision(double):
+            return jax.make_jaxpr(count_from_references)(numbers, *examples)
+
+    origin_ports = [Port(reference.name, "", "", double) for reference in references]
+    start = widen_routine(block.start, block.start_inputs, ())
+    step = widen_routine(block.step, block.inputs, block.state)
+    ports = {group: widen(getattr(block, group)) for group in ("start_inputs", "inputs", "outputs")}
+    return block._replace(**ports, state=[*block.state, *origin_ports], start=start, step=step)

@@ -199,15 +199,14 @@ def _list_variables(plant: PlantProgram) -> list[Scalar]:
         Scalar(plant.outputs[quantity.name], "output", "continuous", quantity.unit, quantity.description)
         for quantity in block.outputs
     ]
-    for path, (value, parameter) in plant.parameter_info.items():
-        kind = "tunable" if path in plant.tunable else "fixed"
+    for path, value, parameter, tunable in plant.parameters.values():
         minimum = parameter.minimum if parameter.above is None else parameter.above
         variables.append(
             Scalar(
                 # by FMI's "structured" naming convention
                 re.sub(r"\.(\d+)(?=\.)", r"[\1]", path),
                 "parameter",
-                kind,
+                "tunable" if tunable else "fixed",
                 parameter.unit,
                 parameter.doc,
                 value,

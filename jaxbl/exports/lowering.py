@@ -25,7 +25,7 @@ _LONGEST_FORMULA = 90
 """Letters of a formula in a comment."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Variable:
     """A number that the code computes or takes as an argument; `name` is "" for a numbered one."""
 
@@ -224,9 +224,6 @@ class _Lowering(ScalarWriter):
         self._is_in_call = False
         """Within a call the source stays that of the call."""
 
-    def variable(self, dtype: Any) -> Variable:
-        return Variable(np.dtype(dtype))
-
     # jaxprs
 
     def write_equation(self, eqn: JaxprEqn, operands: list[Value]) -> list[Value]:
@@ -256,7 +253,7 @@ class _Lowering(ScalarWriter):
                 state = self.write_jaxpr(body, [*constants, *state])
             return state
         source = self._source
-        carried = tuple(self.variable(value.dtype) for value in state)
+        carried = tuple(Variable(value.dtype) for value in state)
         self.statements.append(Repeat(times, carried, tuple(state), self.lower_body(body, [*constants, *carried]), source))
         return list(carried)
 
@@ -269,9 +266,7 @@ class _Lowering(ScalarWriter):
         no, yes = (self.lower_body(branch, operands) for branch in branches)
         # what is the same on both ways is no choice
         differ = [not are_same(a, b) for a, b in zip(yes.results, no.results, strict=True)]
-        merged: list[Any] = [
-            self.variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)
-        ]
+        merged: list[Any] = [Variable(a.dtype) if differs else a for a, differs in zip(yes.results, differ, strict=True)]
         bodies = _select_results(yes, differ), _select_results(no, differ)
         self.statements.append(Choice(condition, tuple(compress(merged, differ)), bodies, source))
         return merged
@@ -302,7 +297,7 @@ class _Lowering(ScalarWriter):
             return simpler
         key = (name, dtype, *operands)
         if key not in self._variable_by_operation:
-            out = self._variable_by_operation[key] = self.variable(dtype)
+            out = self._variable_by_operation[key] = Variable(dtype)
             self._operation_by_variable[out] = Operation(out, name, operands, self._source)
             self.statements.append(self._operation_by_variable[out])
         return self._variable_by_operation[key]

@@ -28,21 +28,26 @@ class MovingDrive(NamedTuple):
     samples: Any
 
 
+class PlantNumber(NamedTuple):
+    """A number of the study that the drive's program reads: path, value, what it may be, and whether `step` reads it."""
+
+    path: str
+    value: float
+    parameter: Parameter
+    tunable: bool
+
+
 class PlantProgram(NamedTuple):
     """The drive as a program whose numbers are given at each call.
 
     Attributes:
         program: `start` and `step` are given those parameters that they read, `step` the input torque before them.
-        parameters: numbers of the study that the program reads, by the name that they have in it: their config paths.
-        parameter_info: the same by config path: value, unit, range, description.
-        tunable: config paths of the numbers that `step` reads.
+        parameters: numbers of the study that the program reads, by the name that they have in it.
         outputs: names of the columns of `trace.parquet`, by the names of the outputs.
     """
 
     program: Program
-    parameters: Mapping[str, str]
-    parameter_info: Mapping[str, tuple[float, Parameter]]
-    tunable: frozenset[str]
+    parameters: Mapping[str, PlantNumber]
     outputs: Mapping[str, str]
 
 
@@ -75,14 +80,13 @@ def build_plant_program(config: Config, name: str, dtype: np.dtype) -> PlantProg
     # the same operations: none of them reads the others
     program = program._replace(block=_trace_plant(experiment, name, dtype, start_parameters, step_parameters))
     source = config.build()
-    parameters_read = {
-        path: parameter for path, parameter in candidates.items() if path in start_parameters or path in step_parameters
-    }
     return PlantProgram(
         program,
-        {_make_identifier(path): path for path in parameters_read},
-        {path: (float(get_leaf(source, path)), parameter) for path, parameter in parameters_read.items()},
-        frozenset(step_parameters),
+        {
+            _make_identifier(path): PlantNumber(path, float(get_leaf(source, path)), parameter, path in step_parameters)
+            for path, parameter in candidates.items()
+            if path in start_parameters | step_parameters
+        },
         {
             parameter.name: re.sub(rf"^({'|'.join(experiment.sides)})_", r"\1.", parameter.name)
             for parameter in program.block.outputs

@@ -265,7 +265,7 @@ def _make_code_name(file: str, unnamed: str) -> str:
 
 def _lower_observers(request: Request) -> Program:
     block = build_observer_chain(request.config, request.name, np.dtype(PRECISIONS[request.precision]))
-    return widen_positions(lower_block(block))
+    return lower_block(widen_positions(block))
 
 
 def _describe_cost(request: Request, program: Program) -> str:

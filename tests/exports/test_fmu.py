@@ -248,7 +248,7 @@ def test_the_motion_is_the_traced_step_bit_for_bit(tmp_path, precision):
     torques = (5.0 * np.sin(8.0 * np.arange(1200) * 1e-3)).astype(dtype)
     plant = build_plant_program(read_config(data), "drive", dtype)
     block = Strict(plant.program.block)
-    inputs = {instance: block.real(plant.parameter_info[path][0]) for instance, path in plant.parameters.items()}
+    inputs = {name: block.real(number.value) for name, number in plant.parameters.items()}
     first, later = plant.program.block.start_inputs, plant.program.block.inputs[1:]
     start = block.start([inputs[instance.name] for instance in first])
     state, rows = start[: len(plant.program.block.state)], []
