@@ -9,7 +9,6 @@ import functools
 import math
 import os
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple, TypeVar
@@ -60,23 +59,9 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
         if program_cache.cache_folder() is None:
             return compile_function()(*args, **kwargs)
         arrays = [_plain(leaf) for leaf in leaves if eqx.is_array(leaf)]
-        static = tuple(_Array() if eqx.is_array(leaf) else leaf for leaf in leaves)
-        # of NumPy's none is weak
-        weak = [isinstance(array, jax.Array) and array.aval.weak_type for array in arrays]
-        key = (
-            function,
-            structure,
-            static,
-            tuple((array.shape, array.dtype, is_weak) for array, is_weak in zip(arrays, weak, strict=True)),
-        )
-        program = _programs.get(key)
-        if program is None:
-            while len(_programs) >= _MOST:
-                _programs.popitem(last=False)
-            program = _programs[key] = _program(function, args, kwargs, arrays)
-        else:
-            _programs.move_to_end(key)
-        return program(arrays)
+        shapes = map(_shape, arrays)
+        examples = tuple(next(shapes) if eqx.is_array(leaf) else leaf for leaf in leaves)
+        return _program(function, structure, examples)(arrays)
 
     return call
 
@@ -89,23 +74,25 @@ def _plain(leaf: Any) -> Any:
     return leaf if jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype else jnp.asarray(leaf)
 
 
-class _Array(NamedTuple):
-    """In the place of an array."""
+def _shape(array: Any) -> jax.ShapeDtypeStruct:
+    """What stands in the place of an array. Of NumPy's none is weak."""
+    is_weak = isinstance(array, jax.Array) and array.aval.weak_type
+    return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=is_weak)
+
+
+def _is_shape(leaf: Any) -> bool:
+    return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 class _Program(NamedTuple):
-    """A compiled program of arrays, and what its result is made of: a pytree with :class:`_Array` in their places."""
+    """A compiled program of arrays, and what its result is made of: a pytree with shapes in their places."""
 
     compiled: Callable[..., list[jax.Array]]
     result: Any
 
     def __call__(self, arrays: list[jax.Array]) -> Any:
         outputs = iter(self.compiled(*arrays))
-
-        def fill(leaf: Any) -> Any:
-            return next(outputs) if isinstance(leaf, _Array) else leaf
-
-        return jax.tree.map(fill, self.result, is_leaf=lambda leaf: isinstance(leaf, _Array))
+        return jax.tree.map(lambda leaf: next(outputs) if _is_shape(leaf) else leaf, self.result)
 
 
 @functools.cache
@@ -119,17 +106,17 @@ def _initialise() -> None:
         jax.jit(jnp.linalg.cholesky).lower(jnp.eye(2))
 
 
-_programs: OrderedDict[Any, _Program] = OrderedDict()
-
-
-def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], arrays: list[jax.Array]) -> _Program:
-    """A program from disk, or compiled and put there."""
+@functools.lru_cache(maxsize=_MOST)
+def _program(function: Callable[..., Any], structure: Any, examples: tuple) -> _Program:
+    """A program from disk, or compiled and put there, for arguments of a structure with shapes in the places of arrays."""
+    args, kwargs = structure.unflatten(examples)
+    shapes = [leaf for leaf in examples if _is_shape(leaf)]
     key = program_cache.program_key("program", function, args, kwargs)
     stored = program_cache.load(key)
     if stored is not None:
         _initialise()
         code, count, devices, result = stored
-        inputs = jax.tree.structure((tuple(arrays), {}))
+        inputs = jax.tree.structure((tuple(shapes), {}))
         try:
             loaded = deserialize_and_load(
                 code, inputs, jax.tree.structure([0] * count), execution_devices=jax.local_devices()[:devices]
@@ -137,13 +124,13 @@ def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], 
             return _Program(loaded, result)
         except Exception:  # whatever another version of JAX, or another machine, makes of it
             pass
-    dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
-    structure, results = jax.tree.structure(dynamic), []
+    results = []
 
     def flat(*inputs: Any) -> list[Any]:
-        args, kwargs = eqx.combine(structure.unflatten(inputs), static)
+        arrays = iter(inputs)
+        args, kwargs = structure.unflatten(next(arrays) if _is_shape(leaf) else leaf for leaf in examples)
         out = function(*args, **kwargs)
-        results.append(jax.tree.map(lambda leaf: _Array() if eqx.is_array(leaf) else leaf, out))
+        results.append(jax.tree.map(lambda leaf: _shape(leaf) if eqx.is_array(leaf) else leaf, out))
         return [leaf for leaf in jax.tree.leaves(out) if eqx.is_array(leaf)]
 
     flat.__name__ = getattr(function, "__name__", "program")
@@ -153,7 +140,7 @@ def _program(function: Callable[..., Any], args: tuple, kwargs: dict[str, Any], 
         flat.__name__ += f"_{os.getpid()}_{time.time_ns()}"
         jax.config.update(_LEAST, math.inf)
     try:
-        compiled = jax.jit(flat, compiler_options=_options()).lower(*arrays).compile()
+        compiled = jax.jit(flat, compiler_options=_options()).lower(*shapes).compile()
     finally:
         jax.config.update(_LEAST, least)
     shardings = jax.tree.leaves(compiled.output_shardings)
