@@ -8,7 +8,7 @@ derivatives of its steps.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -21,6 +21,8 @@ SCAN_MESSAGE = "The fused loop does not support %s; the slower scan is used."
 
 
 Arrays = list[np.ndarray]
+ArrayGroup = Sequence[np.ndarray] | np.ndarray
+"""Arrays one by one, or as the rows of one array."""
 Leaves = list[Any]
 """Leaves of a tree: numbers or arrays, traced or not."""
 

@@ -6,15 +6,13 @@ neither lane nor time, *shared* if it depends on time alone, and a *lane's* othe
 
 import enum
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from . import Leaves, Unsupported
-from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate_equations, jaxpr_as_fun, read_variable, trace_inlined
+from .jaxprs import ClosedJaxpr, JaxprEqn, Literal, Var, evaluate_equations, read_variable, trace_inlined
 
 LANE_DTYPES = ("float32", "float64", "int32", "uint32", "int64", "bool")
 """Types of numbers that lanes may read."""
@@ -98,7 +96,7 @@ def split_by_lane(
     carry: Any,
     inputs: Any,
     carry_dependences: Sequence[Dependence],
-    result_dependences: Sequence[Dependence] | None = None,
+    result_dependences: Sequence[Dependence] = (),
 ) -> LaneSplit:
     """Split a function `f(values, carry, inputs)` of one lane into what all lanes share and what each lane does.
 
@@ -106,7 +104,7 @@ def split_by_lane(
         function: to be split.
         values, carry, inputs: examples of its arguments.
         carry_dependences: of the carry's leaves.
-        result_dependences: that the results are to have; left out, those that follow.
+        result_dependences: that the first results are to have; the others have those that follow.
 
     Raises:
         Unsupported: lanes read something that is no number: an array, or the state of a random number generator.
@@ -124,8 +122,8 @@ def split_by_lane(
     shared_equations = [eqn for eqn in live if not any(dependences[out] & Dependence.LANE for out in eqn.outvars)]
     constants = dict(zip(jaxpr.constvars, closed.consts, strict=True))
 
-    result_dependences = result_dependences or [_read_dependence(dependences, out) for out in jaxpr.outvars]
-    is_lane_result = [bool(dependence & Dependence.LANE) for dependence in result_dependences]
+    following = [_read_dependence(dependences, out) for out in jaxpr.outvars[len(result_dependences) :]]
+    is_lane_result = [bool(dependence & Dependence.LANE) for dependence in (*result_dependences, *following)]
     lane_results = [out for out, is_lane in zip(jaxpr.outvars, is_lane_result, strict=True) if is_lane]
     read = dict.fromkeys(v for eqn in lane_equations for v in eqn.invars if isinstance(v, Var))
     read |= dict.fromkeys(v for v in lane_results if isinstance(v, Var))
@@ -164,58 +162,6 @@ def split_by_lane(
 
     examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in [*lane_vars, *handed_over]]
     return LaneSplit(compute_shared, jax.make_jaxpr(compute_lane)(*examples), is_lane_result)
-
-
-class StateSplit(NamedTuple):
-    """A function `f(state, inputs) -> (state, outputs)` of one sample in two parts.
-
-    Attributes:
-        is_stateless: for each output, True if it needs no state.
-        compute_stateless: takes `inputs`; returns the outputs that need no state, and what `step` reads.
-        step: takes the state and what it reads; returns the state, and the outputs that need it.
-    """
-
-    is_stateless: list[bool]
-    compute_stateless: Callable[[Any], tuple[Leaves, Leaves]]
-    step: ClosedJaxpr
-
-
-def split_by_state(function: Callable[..., tuple[Leaves, Leaves]], state: Sequence[Any], inputs: Any) -> StateSplit:
-    """Split `f(state, inputs)` into what needs the state of the sample before, and what all samples can compute at once.
-
-    Args:
-        function: to be split.
-        state, inputs: examples of its arguments.
-
-    Raises:
-        Unsupported: the part that needs the state reads something that is no number.
-    """
-    count = len(state)
-    jaxpr = trace_inlined(function, list(state), inputs).jaxpr
-    arguments = [Dependence.LANE] * count + [Dependence.SHARED] * (len(jaxpr.invars) - count)
-    dependences = _propagate_dependences(jaxpr, arguments)
-    is_stateless = [not _read_dependence(dependences, out) & Dependence.LANE for out in jaxpr.outvars[count:]]
-    output_dependences = [Dependence.SHARED if stateless else Dependence.LANE for stateless in is_stateless]
-    carry_dependences = [Dependence.LANE] * count + output_dependences
-
-    def combine(values: Any, carry: Leaves, inputs: Any) -> Leaves:
-        state, outputs = function(carry[:count], inputs)
-        return [*state, *outputs]
-
-    # outputs stand in the carry, from which nothing reads them
-    slots = [jax.ShapeDtypeStruct(out.aval.shape, out.aval.dtype) for out in jaxpr.outvars[count:]]
-    parts = split_by_lane(combine, [], [*state, *slots], inputs, carry_dependences, carry_dependences)
-    unread = [
-        jnp.zeros(slot.shape, slot.dtype) for slot, stateless in zip(slots, is_stateless, strict=True) if not stateless
-    ]
-
-    def step(state: Leaves, read: Leaves) -> Leaves:
-        return jaxpr_as_fun(parts.lane)(*state, *unread, *read)
-
-    read = parts.lane.jaxpr.invars[count + len(unread) :]
-    examples = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in read]
-    compute_stateless = partial(parts.shared, [None] * sum(is_stateless))
-    return StateSplit(is_stateless, compute_stateless, trace_inlined(step, list(state), examples))
 
 
 def _read_dependence(dependences: dict[Var, Dependence], v: Var | Literal) -> Dependence:

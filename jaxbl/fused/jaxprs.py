@@ -26,11 +26,6 @@ class UnknownForm(Exception):
     """JAX writes an equation in a way that is not known here."""
 
 
-def trace(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
-    """Trace a function of pytrees. Calls inside stay calls, which takes half the time of inlining them."""
-    return jax.make_jaxpr(function)(*examples)
-
-
 def trace_inlined(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
     """Trace a function of pytrees, and inline its calls."""
     return replace_primitives(jax.make_jaxpr(function)(*examples), {})
@@ -39,7 +34,7 @@ def trace_inlined(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
 @lru_cache(maxsize=64)
 def trace_scalar_function(function: Callable[[Any], Any], dtype: Any) -> ClosedJaxpr:
     """Trace a function of one number, once for each type."""
-    return trace(function, jax.ShapeDtypeStruct((), dtype))
+    return jax.make_jaxpr(function)(jax.ShapeDtypeStruct((), dtype))
 
 
 def replace_primitives(closed: ClosedJaxpr, functions: Mapping[str, Callable[..., Any]]) -> ClosedJaxpr:

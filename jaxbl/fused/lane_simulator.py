@@ -4,7 +4,6 @@ import abc
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -25,9 +24,9 @@ from jaxbl.chain import (
 )
 from jaxbl.drive.parameters import set_leaves
 
-from . import Arrays, Leaves
+from . import ArrayGroup, Arrays, Leaves
 from .dependence import Dependence, LoopHooks, find_carry_dependences, split_by_lane
-from .llvm import AddressedArrays, ArrayRows, Loop, LoopArrays, vector_lanes
+from .llvm import Loop, LoopArrays, allocate, vector_lanes
 from .noise import host_device
 from .shared_part import SharedPart, compile_shared_part
 
@@ -54,15 +53,15 @@ class SharedInputs(NamedTuple):
     """
 
     length: int
-    sample_inputs: AddressedArrays
-    block_inputs: AddressedArrays
+    sample_inputs: Arrays
+    block_inputs: Arrays
     final_inputs: Arrays | None
     shared_metrics: Arrays
 
     @property
     def nbytes(self) -> int:
         """Bytes of the inputs of samples and blocks."""
-        return sum(array.nbytes for inputs in (self.sample_inputs, self.block_inputs) for array in inputs.arrays)
+        return sum(array.nbytes for array in (*self.sample_inputs, *self.block_inputs))
 
 
 class LaneSimulator(abc.ABC):
@@ -184,9 +183,7 @@ class LaneSimulator(abc.ABC):
             final_inputs, shared_metrics = None, []
             if first + length == self._steps:
                 shared_metrics, final_inputs = ([np.asarray(x) for x in part] for part in self._finish_shared_part(state))
-            sample_inputs, block_inputs = (
-                AddressedArrays([np.asarray(x) for x in outputs]) for outputs in (sample_outputs, block_outputs)
-            )
+            sample_inputs, block_inputs = ([np.asarray(x) for x in part] for part in (sample_outputs, block_outputs))
             yield SharedInputs(length, sample_inputs, block_inputs, final_inputs, shared_metrics)
 
     @abc.abstractmethod
@@ -208,25 +205,18 @@ class HostSimulator(LaneSimulator):
         self._loop = Loop(
             self._step, self._dtype, values=len(paths), carry=self.carry_count, hooks=self._hooks, lanes=self._vector_lanes
         )
-        self._dtypes = {
-            name: [spec.dtype for spec in self._loop.signature if spec.name.startswith(name)]
-            for name in ("final input", "block flag", "result")
-        }
         # each pool has one thread, so that its lanes take span after span, whatever the other threads do
         work = self._padded_lanes * self._steps * dtype.itemsize
         count = min(threads, self._padded_lanes // self._vector_lanes, max(work // _THREAD_WORK, 1))
         self._pools = [ThreadPoolExecutor(1) for _ in range(count)]
 
     def _simulate(self, values, spans):
+        rows = np.asarray(values, self._dtype).reshape(len(values), self._padded_lanes)
+        results = allocate(self._loop.signature["results"], (self._padded_lanes,))
         # vectors of lanes are dealt in turns: lanes that are done together are often neighbours, and then leave all threads
-        count = len(self._pools)
-        rows = np.stack(values) if values else np.empty((0, self._padded_lanes), self._dtype)
-        vectors = rows.reshape(len(values), -1, self._vector_lanes)
+        vectors, count = np.arange(self._padded_lanes).reshape(-1, self._vector_lanes), len(self._pools)
         threads = [
-            _ThreadLanes(
-                self._loop, self._dtypes, vectors[:, i::count].reshape(len(values), -1), self.carry_count, self._block_length
-            )
-            for i in range(count)
+            _ThreadLanes(self._loop, vectors[i::count].ravel(), rows, results, self._block_length) for i in range(count)
         ]
         running: deque[list[Future[None]]] = deque()
         inputs = None
@@ -248,12 +238,7 @@ class HostSimulator(LaneSimulator):
             while is_last and running:
                 _wait_for(running.popleft())
         assert inputs is not None
-        results = [np.empty((len(rows), self._padded_lanes), rows.dtype) for rows in threads[0].results]
-        for i, thread in enumerate(threads):
-            for all_lanes, part in zip(results, thread.results, strict=True):
-                vectors = all_lanes.reshape(len(all_lanes), -1, self._vector_lanes)
-                vectors[:, i::count] = part.reshape(len(part), -1, self._vector_lanes)
-        return [metric for rows in results for metric in rows], inputs.shared_metrics
+        return [*results], inputs.shared_metrics
 
 
 def _wait_for(futures: Iterable[Future[None]]) -> None:
@@ -266,97 +251,86 @@ class _ThreadLanes:
 
     Args:
         loop: the compiled loop.
-        dtypes: types of the loop's arrays, by the name of their group.
-        values: values of the lanes, `(paths, lanes)`.
-        carry_count: number of values that a lane carries.
+        lanes: places of the thread's lanes among all.
+        values: values of all lanes, `(paths, all lanes)`.
+        results: metrics of all lanes, `(all lanes,)` each; those of the thread's lanes are written.
         block_length: number of samples of a block.
     """
 
-    def __init__(
-        self, loop: Loop, dtypes: dict[str, list[np.dtype]], values: np.ndarray, carry_count: int, block_length: int
-    ):
-        self._loop, self._dtypes, self._block_length, self._has_begun = loop, dtypes, block_length, False
+    def __init__(self, loop: Loop, lanes: np.ndarray, values: np.ndarray, results: ArrayGroup, block_length: int):
+        self._loop, self._results, self._block_length, self._has_begun = loop, results, block_length, False
         # places of the running lanes, and their values and carry; further columns are padding
-        self._lanes = np.arange(values.shape[1])
-        self._values_and_carry = np.empty((len(values) + carry_count, values.shape[1]), values.dtype)
-        self._values_and_carry[: len(values)] = values
-        self._prepared: tuple[Arrays, Arrays, LoopArrays] | None = None
-        self._finished_lanes: list[tuple[np.ndarray, np.ndarray]] = []
-        self._results: list[tuple[np.ndarray, Arrays]] = []
+        self._lanes = lanes
+        self._values_and_carry = np.empty((len(values) + len(loop.signature["carry"]), len(lanes)), values.dtype)
+        self._values_and_carry[: len(values)] = values[:, lanes]
+        self._prepared: tuple[ArrayGroup, ArrayGroup, LoopArrays] | None = None
+        self._done_lanes: list[tuple[np.ndarray, np.ndarray]] = []
 
     def simulate_span(self, inputs: SharedInputs) -> None:
         """Simulate the lanes over a span; a call of the loop takes several blocks if the lanes are few."""
-        start = 0
+        start, is_last = 0, inputs.final_inputs is not None
         while start < inputs.length and len(self._lanes):
             flags, results, arrays = self._prepared or self.prepare_arrays(inputs)
-            width = self._values_and_carry.shape[1]
-            blocks = max(_CALL_WORK // (width * self._block_length), 1)
+            blocks = max(_CALL_WORK // (arrays.lanes * self._block_length), 1)
             end = min(start + blocks * self._block_length, inputs.length)
-            is_end = inputs.final_inputs is not None and end == inputs.length
-            self._loop(
-                arrays, end, width, start=start, block_length=self._block_length, begins=not self._has_begun, ends=is_end
-            )
+            is_end = is_last and end == inputs.length
+            self._loop(arrays, end, start=start, begins=not self._has_begun, ends=is_end)
             self._has_begun, start = True, end
             if is_end:
-                self._results.append((self._lanes, results))
+                self._store_results(results)
             elif len(flags):
                 self._remove_done_lanes(flags[0][(end - 1) // self._block_length])
         self._prepared = None
-        if inputs.final_inputs is not None and self._finished_lanes:
+        if is_last and self._done_lanes:
             # metrics of the lanes that were removed
             self._lanes, self._values_and_carry = (
-                np.concatenate(parts, axis=-1) for parts in zip(*self._finished_lanes, strict=True)
+                np.concatenate(parts, axis=-1) for parts in zip(*self._done_lanes, strict=True)
             )
             self._select_lanes(np.arange(len(self._lanes)))
             _, results, arrays = self.prepare_arrays(inputs)
-            self._loop(arrays, 0, self._values_and_carry.shape[1], block_length=self._block_length, ends=True)
-            self._results.append((self._lanes, results))
+            self._loop(arrays, 0, ends=True)
+            self._store_results(results)
 
-    def prepare_arrays(self, inputs: SharedInputs) -> tuple[Arrays, Arrays, LoopArrays]:
+    def prepare_arrays(self, inputs: SharedInputs) -> tuple[ArrayGroup, ArrayGroup, LoopArrays]:
         """Make the arrays of the loop for a span.
 
         Returns:
-            Flags that are true for lanes that are done, `(blocks, lanes)`; results `(metrics, lanes)` for each type of
-            number; and all arrays of the loop.
+            Flags that are true for lanes that are done, `(blocks, lanes)`; results `(lanes,)`; and all arrays of the loop.
         """
-        width = self._values_and_carry.shape[1]
-        blocks = -(-inputs.length // self._block_length)
-        flags = [np.empty((blocks, width), dtype) for dtype in self._dtypes["block flag"]]
-        results = [np.empty((len(list(group)), width), dtype) for dtype, group in groupby(self._dtypes["result"])]
-        unread = [np.zeros((), dtype) for dtype in self._dtypes["final input"]]
-        final_inputs = unread if inputs.final_inputs is None else inputs.final_inputs
-        lane_rows = ArrayRows(self._values_and_carry)
-        groups = [lane_rows, inputs.sample_inputs, inputs.block_inputs, *final_inputs, *flags, *map(ArrayRows, results)]
-        arrays = LoopArrays(self._loop.signature, groups, inputs.length, width, self._block_length)
+        signature, width = self._loop.signature, self._values_and_carry.shape[1]
+        blocks, count = -(-inputs.length // self._block_length), len(signature["values"])
+        flags, results = allocate(signature["flags"], (blocks, width)), allocate(signature["results"], (width,))
+        unread = [np.zeros((), dtype) for dtype in signature["final_inputs"]]
+        groups = {
+            "values": self._values_and_carry[:count],
+            "carry": self._values_and_carry[count:],
+            "sample_inputs": inputs.sample_inputs,
+            "block_inputs": inputs.block_inputs,
+            "final_inputs": unread if inputs.final_inputs is None else inputs.final_inputs,
+            "flags": flags,
+            "results": results,
+        }
+        arrays = LoopArrays(signature, groups, inputs.length, width, self._block_length)
         self._prepared = flags, results, arrays
         return self._prepared
 
-    @property
-    def results(self) -> Arrays:
-        """Results of all lanes, an array `(metrics, lanes)` for each type of number."""
-        if not self._finished_lanes:
-            return self._results[0][1]
-        count = sum(len(lanes) for lanes, _ in self._results)
-        merged = [np.empty((len(rows), count), rows.dtype) for rows in self._results[0][1]]
-        for lanes, results in self._results:
-            for all_lanes, part in zip(merged, results, strict=True):
-                all_lanes[:, lanes] = part[:, : len(lanes)]
-        return merged
+    def _store_results(self, results: ArrayGroup) -> None:
+        for all_lanes, part in zip(self._results, results, strict=True):
+            all_lanes[self._lanes] = part[: len(self._lanes)]
 
     def _remove_done_lanes(self, flags: np.ndarray) -> None:
         """Remove the lanes that are done, if there are enough of them to pay for moving the others."""
         is_done = flags[: len(self._lanes)]
         remaining = np.flatnonzero(~is_done)
-        padded = -(-len(remaining) // self._loop.lanes) * self._loop.lanes
-        if padded <= _COMPACTION_SHARE * self._values_and_carry.shape[1]:
+        if self._loop.whole_vectors(len(remaining)) <= _COMPACTION_SHARE * self._values_and_carry.shape[1]:
             done = np.flatnonzero(is_done)
-            self._finished_lanes.append((self._lanes[done], self._values_and_carry[:, done]))
+            self._done_lanes.append((self._lanes[done], self._values_and_carry[:, done]))
             self._select_lanes(remaining)
 
     def _select_lanes(self, places: np.ndarray) -> None:
         """Keep only the lanes at these places, padded to whole vectors."""
-        padded = -(-len(places) // self._loop.lanes) * self._loop.lanes
-        columns = np.pad(places, (0, padded - len(places)), "edge") if len(places) else places
+        padding = self._loop.whole_vectors(len(places)) - len(places)
+        columns = np.pad(places, (0, padding), "edge") if padding else places
         self._lanes, self._values_and_carry = self._lanes[places], np.take(self._values_and_carry, columns, axis=1)
         self._prepared = None
 
@@ -402,7 +376,7 @@ class DeviceSimulator(LaneSimulator):
     def join_spans(spans: Iterable[SharedInputs]) -> tuple[Arrays, Arrays, Arrays]:
         """Join the shared inputs of all spans: arrays for samples and for blocks, and the inputs of the metrics."""
         all_spans = list(spans)
-        samples = zip(*(inputs.sample_inputs.arrays for inputs in all_spans), strict=True)
-        blocks = zip(*(inputs.block_inputs.arrays for inputs in all_spans), strict=True)
+        samples = zip(*(inputs.sample_inputs for inputs in all_spans), strict=True)
+        blocks = zip(*(inputs.block_inputs for inputs in all_spans), strict=True)
         sample_inputs, block_inputs = ([np.concatenate(column) for column in columns] for columns in (samples, blocks))
         return sample_inputs, block_inputs, all_spans[-1].final_inputs or []

@@ -5,16 +5,16 @@ of the machine it runs on. Calls into it release the interpreter's lock, so that
 """
 
 import ctypes
-from array import array
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from array import array as array_of_numbers
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from itertools import islice
+from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
 
-from . import Unsupported
+from . import ArrayGroup, Unsupported
 from .dependence import NO_HOOKS, LoopHooks
 from .jaxprs import ClosedJaxpr, JaxprEqn
 from .scalar_writer import COMPARISONS, ScalarWriter
@@ -58,57 +58,14 @@ def vector_lanes(dtype: np.dtype) -> int:
     return 2 * size // dtype.itemsize
 
 
-class ArraySpec(NamedTuple):
-    """An array that a loop reads or writes in place.
-
-    Attributes:
-        name: its group, and its place in the group (`sample input 2`).
-        dtype: type of its numbers.
-        extent: what it has a number for: "lanes", "samples", "blocks", "samples and lanes", "blocks and lanes"; or "scalar".
-        alike: number of arrays, from this one on, of the same type and extent.
-    """
-
-    name: str
-    dtype: np.dtype
-    extent: str
-    alike: int
-
-    def check(self, array: np.ndarray, counts: dict[str, int]) -> None:
-        """Raise `ValueError` for an array of wrong type or length, or with gaps; `counts` are numbers by extent."""
-        count = counts[self.extent]
-        if array.dtype != self.dtype or array.size != count or not array.flags.c_contiguous:
-            wrong = f"not {array.size} of {array.dtype}"
-            raise ValueError(f"{self.name} of a loop needs {count} contiguous numbers of type {self.dtype}, {wrong}")
-
-
-def loop_signature(
-    body: ClosedJaxpr, hooks: LoopHooks, values: int, carry: int, constants: int, lane_inputs: int
-) -> list[ArraySpec]:
-    """The arrays of a loop in their order; arguments as for :class:`Loop` and :class:`LoopHooks`."""
-    carry_end, read = values + carry, body.jaxpr.invars
-    inputs_start, inputs_end = carry_end + constants, len(read) - lane_inputs
-    groups: list[tuple[str, str, Sequence[Any]]] = [
-        ("value", "lanes", read[:values]),
-        ("carry", "lanes", read[values:carry_end]),
-        ("constant", "scalar", read[carry_end:inputs_start]),
-        ("sample input", "samples", read[inputs_start:inputs_end]),
-        ("lane's sample input", "samples and lanes", read[inputs_end:]),
-        ("block input", "blocks", hooks.after_block.jaxpr.invars[carry_end:] if hooks.after_block else []),
-        ("final input", "scalar", hooks.finish.jaxpr.invars[carry_end:] if hooks.finish else []),
-        ("sample output", "samples and lanes", body.jaxpr.outvars[carry:]),
-        ("block flag", "blocks and lanes", hooks.after_block.jaxpr.outvars[carry:] if hooks.after_block else []),
-        ("result", "lanes", hooks.finish.jaxpr.outvars if hooks.finish else []),
-    ]
-    arrays = [
-        (f"{name} {i}", _LoopWriter.check_type(v.aval.dtype), extent)
-        for name, extent, variables in groups
-        for i, v in enumerate(variables)
-    ]
-    specs: list[ArraySpec] = []
-    for name, dtype, extent in reversed(arrays):
-        is_like_next = specs and specs[-1].dtype == dtype and specs[-1].extent == extent
-        specs.append(ArraySpec(name, dtype, extent, 1 + specs[-1].alike if is_like_next else 1))
-    return specs[::-1]
+Signature = dict[str, list[np.dtype]]
+"""Types of the numbers in a loop's arrays, by group."""
+_EXTENTS = {
+    "values": "lanes", "carry": "lanes", "constants": "scalar", "sample_inputs": "samples",
+    "lane_inputs": "samples and lanes", "block_inputs": "blocks", "final_inputs": "scalar",
+    "outputs": "samples and lanes", "flags": "blocks and lanes", "results": "lanes",
+}  # fmt: skip
+"""Groups of arrays in the order of a loop's table, and what each of their arrays has a number for."""
 
 
 class Loop:
@@ -118,12 +75,14 @@ class Loop:
         body: jaxpr of one sample, scalars of one lane: values, carry, constants, inputs of the sample, and inputs of the
             sample for this lane alone -> carry, and outputs of the sample.
         dtype: type of the lanes' numbers.
-        values: how many numbers differ from lane to lane.
-        carry: how many numbers a lane carries from sample to sample.
-        constants: how many numbers all lanes read unchanged in a call.
-        lane_inputs: how many inputs of a sample each lane has for itself.
+        counts: how many `values` differ from lane to lane; how many numbers a lane takes as its `carry` from sample to
+            sample; how many `constants` all lanes read unchanged in a call; how many `lane_inputs` of a sample each lane
+            has for itself. What remains are inputs of the sample.
         hooks: what runs before, between and after the blocks.
         lanes: that are computed together; left out, as many as suit the machine.
+
+    Attributes:
+        signature: what the arrays of each group hold.
 
     Raises:
         Unsupported: an operation of these functions is unknown here.
@@ -134,15 +93,25 @@ class Loop:
         body: ClosedJaxpr,
         dtype: np.dtype,
         *,
-        values: int = 0,
-        carry: int = 0,
-        constants: int = 0,
-        lane_inputs: int = 0,
         hooks: LoopHooks = NO_HOOKS,
         lanes: int | None = None,
+        **counts: int,
     ):
         self.lanes = lanes or vector_lanes(dtype)
-        self.signature = loop_signature(body, hooks, values, carry, constants, lane_inputs)
+        read = iter(body.jaxpr.invars)
+        counts = {"sample_inputs": len(body.jaxpr.invars) - sum(counts.values())} | counts
+        # the groups that a sample reads are the first ones
+        groups = {group: [*islice(read, counts.get(group, 0))] for group in _EXTENTS}
+        carry, lane_count = len(groups["carry"]), len(groups["values"]) + len(groups["carry"])
+        groups["outputs"] = body.jaxpr.outvars[carry:]
+        if hooks.after_block:
+            after_block = hooks.after_block.jaxpr
+            groups |= {"block_inputs": after_block.invars[lane_count:], "flags": after_block.outvars[carry:]}
+        if hooks.finish:
+            groups |= {"final_inputs": hooks.finish.jaxpr.invars[lane_count:], "results": hooks.finish.jaxpr.outvars}
+        self.signature: Signature = {
+            group: [_LoopWriter.check_type(v.aval.dtype) for v in variables] for group, variables in groups.items()
+        }
         module = ir.Module("loop")
         _LoopWriter(module, self.lanes).write_loop(body, hooks, self.signature)
         parsed = binding.parse_assembly(str(module))
@@ -159,71 +128,84 @@ class Loop:
         address = self._engine.get_function_address("loop")
         self._call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * _SCALAR_ARGUMENTS)(address)
 
-    def __getstate__(self) -> tuple[int, list[ArraySpec], bytes]:
+    def __getstate__(self) -> tuple[int, Signature, bytes]:
         return self.lanes, self.signature, self._code
 
-    def __setstate__(self, state: tuple[int, list[ArraySpec], bytes]) -> None:
+    def __setstate__(self, state: tuple[int, Signature, bytes]) -> None:
         self.lanes, self.signature, code = state
         self._load(code)
 
-    def __call__(
-        self,
-        arrays: "LoopArrays | ArrayGroups",
-        end: int,
-        lanes: int,
-        *,
-        start: int = 0,
-        block_length: int | None = None,
-        begins: bool = False,
-        ends: bool = False,
-    ) -> None:
+    def __call__(self, arrays: "LoopArrays", end: int, *, start: int = 0, begins: bool = False, ends: bool = False) -> None:
         """Take lanes through samples; the carry's arrays are overwritten.
 
         Args:
-            arrays: in the order of the signature. Outputs are `(samples, lanes)` and flags `(blocks, lanes)`, with as many
-                lanes as run.
+            arrays: those that are read and written.
             end: the sample before which the loop ends.
-            lanes: how many, a multiple of those that are computed together.
             start: the first sample, with which a block must begin.
-            block_length: samples of a block; left out, all samples are one block.
             begins: the run begins here: the carry is made, not read.
             ends: the run ends here: results are written, not the carry.
 
         Raises:
-            ValueError: arrays do not fit the signature, or no block begins at `start`.
+            ValueError: the arrays have fewer samples, or no block begins at `start`.
         """
-        fitted = arrays if isinstance(arrays, LoopArrays) else LoopArrays(self.signature, arrays, end, lanes, block_length)
-        if end > fitted.steps or lanes > fitted.lanes:
-            made_for = f"arrays were made for {fitted.steps} and {fitted.lanes}"
-            raise ValueError(f"{end} samples of lanes up to {lanes}: {made_for}")
-        if start % fitted.block_length:
-            raise ValueError(f"no block of {fitted.block_length} samples begins at {start}")
-        self._call(fitted.table, start, end, fitted.block_length, lanes, begins, ends)
+        if end > arrays.steps or start % arrays.block_length:
+            raise ValueError(f"samples {start} to {end}: not of {arrays.steps} in blocks of {arrays.block_length}")
+        self._call(arrays.table, start, end, arrays.block_length, arrays.lanes, begins, ends)
+
+    def whole_vectors(self, lanes: int) -> int:
+        """The number of lanes, rounded up to one that fills the vectors."""
+        return -(-lanes // self.lanes) * self.lanes
+
+    def run(
+        self, steps: int, lanes: int = 1, block_length: int | None = None, **inputs: ArrayGroup
+    ) -> tuple[ArrayGroup, ArrayGroup, ArrayGroup]:
+        """Take lanes through all samples; vectors are filled with repetitions of the last lane.
+
+        Args:
+            steps: number of samples.
+            lanes: number of lanes.
+            block_length: samples of a block; left out, all samples are one block.
+            inputs: arrays of the groups that are read.
+
+        Returns:
+            The carry `(lanes,)`, outputs `(samples, lanes)`, and flags `(blocks, lanes)`.
+        """
+        width = self.whole_vectors(lanes)
+        blocks, padding = -(-steps // (block_length or max(steps, 1))), (0, width - lanes)
+        groups: dict[str, ArrayGroup] = {
+            "outputs": allocate(self.signature["outputs"], (steps, width)),
+            "flags": allocate(self.signature["flags"], (blocks, width)),
+        }
+        for name, arrays in inputs.items():
+            if any(padding) and len(arrays) and "lanes" in _EXTENTS[name]:
+                stack = np.asarray(arrays)
+                arrays = np.pad(stack, [*[(0, 0)] * (stack.ndim - 1), padding], "edge")
+            groups[name] = [*map(np.array, arrays)] if name == "carry" else arrays
+        self(LoopArrays(self.signature, groups, steps, width, block_length), steps)
+        carry, outputs, flags = (groups.get(name, ()) for name in ("carry", "outputs", "flags"))
+        if any(padding):
+            carry, outputs, flags = ([array[..., :lanes] for array in arrays] for arrays in (carry, outputs, flags))
+        return carry, outputs, flags
 
 
-class ArrayRows(NamedTuple):
-    """The rows of an array, in place of as many arrays of a loop; they lie one behind the other."""
-
-    array: np.ndarray
-
-
-class AddressedArrays:
-    """Several arrays of a loop together with their addresses, which NumPy takes long to find."""
-
-    def __init__(self, arrays: Sequence[np.ndarray]):
-        self.arrays, self.addresses = arrays, [_address(array) for array in arrays]
-
-
-ArrayGroups = Sequence[np.ndarray | ArrayRows | AddressedArrays]
+def allocate(dtypes: Sequence[np.dtype], shape: tuple[int, ...]) -> ArrayGroup:
+    """New arrays of these types, as rows of one array if the types are the same."""
+    if len(set(dtypes)) == 1:
+        return np.empty((len(dtypes), *shape), dtypes[0])
+    return [np.empty(shape, dtype) for dtype in dtypes]
 
 
 class LoopArrays:
-    """Arrays that were checked against a loop's signature, for a number of samples and lanes and a length of block."""
+    """Arrays that were checked against a loop's signature, for a number of samples and lanes and a length of block.
+
+    Raises:
+        ValueError: an array is missing, has gaps, or is of the wrong type or length.
+    """
 
     def __init__(
         self,
-        signature: Sequence[ArraySpec],
-        groups: ArrayGroups,
+        signature: Signature,
+        groups: Mapping[str, ArrayGroup],
         steps: int,
         lanes: int,
         block_length: int | None = None,
@@ -234,39 +216,23 @@ class LoopArrays:
             "scalar": 1, "lanes": lanes, "samples": steps, "blocks": blocks,
             "samples and lanes": steps * lanes, "blocks and lanes": blocks * lanes,
         }  # fmt: skip
-        count = sum(_array_count(group) for group in groups)
-        if count != len(signature):
-            raise ValueError(f"a loop needs {len(signature)} arrays, not {count}")
         addresses: list[int] = []
-        for group in groups:
-            specs = signature[len(addresses) : len(addresses) + _array_count(group)]
-            if isinstance(group, AddressedArrays):
-                for spec, member in zip(specs, group.arrays, strict=True):
-                    spec.check(member, counts)
-                addresses += group.addresses
-            elif not isinstance(group, ArrayRows):
-                specs[0].check(group, counts)
-                addresses.append(_address(group))
-            elif specs:
-                specs[0].check(group.array[:1], counts)
-                if specs[0].alike < len(specs) or not group.array.flags.c_contiguous:
-                    unlike = specs[specs[0].alike] if specs[0].alike < len(specs) else specs[0]
-                    raise ValueError(f"{unlike.name} of a loop is no row of one array")
-                address, stride = _address(group.array), group.array.strides[0]
-                addresses += range(address, address + len(specs) * stride, stride)
+        for name, dtypes in signature.items():
+            arrays, count = groups.get(name, ()), counts[_EXTENTS[name]]
+            if len(arrays) != len(dtypes):
+                raise ValueError(f"a loop needs {len(dtypes)} {name}, not {len(arrays)}")
+            # rows of one array are checked at once: NumPy takes long to find an address
+            is_stack = isinstance(arrays, np.ndarray) and len(set(dtypes)) == 1
+            for array, dtype in [(arrays, dtypes[0])] if is_stack else zip(arrays, dtypes, strict=True):
+                rows = len(dtypes) if is_stack else 1
+                if array.dtype != dtype or array.size != rows * count or not array.flags.c_contiguous:
+                    wrong = f"not {array.size} of {array.dtype}"
+                    raise ValueError(f"{name} of a loop: {rows * count} contiguous numbers of type {dtype} needed, {wrong}")
+                first = array.__array_interface__["data"][0]
+                addresses += [first + row * count * dtype.itemsize for row in range(rows)]
         # an array of ctypes takes twenty times as long to make
-        self._groups, self._table = list(groups), array("Q", addresses)
+        self._groups, self._table = groups, array_of_numbers("Q", addresses)
         self.table = self._table.buffer_info()[0]
-
-
-def _array_count(group: np.ndarray | ArrayRows | AddressedArrays) -> int:
-    if isinstance(group, ArrayRows):
-        return len(group.array)
-    return len(group.arrays) if isinstance(group, AddressedArrays) else 1
-
-
-def _address(array: np.ndarray) -> int:
-    return array.__array_interface__["data"][0]
 
 
 class _LoopWriter(ScalarWriter):
@@ -279,7 +245,7 @@ class _LoopWriter(ScalarWriter):
         self.invariants: set[Vector] = set()
         """Vectors that do not change in the loop over time."""
 
-    def write_loop(self, body: ClosedJaxpr, hooks: LoopHooks, signature: Sequence[ArraySpec]) -> None:
+    def write_loop(self, body: ClosedJaxpr, hooks: LoopHooks, signature: Signature) -> None:
         function_type = ir.FunctionType(ir.VoidType(), [_POINTER, *[_INT] * _SCALAR_ARGUMENTS])
         function = ir.Function(self.module, function_type, "loop")
         # what registers have no room for lies on the stack: no vector of it over two lines of the cache
@@ -288,13 +254,14 @@ class _LoopWriter(ScalarWriter):
         table, start, steps, block_length, width, begins, ends = function.args
         build: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.build = build
-        places: defaultdict[str, list[int]] = defaultdict(list)
-        for i, spec in enumerate(signature):
-            places[spec.name.rpartition(" ")[0]].append(i)
+        places: dict[str, range] = {}
+        dtypes: list[np.dtype] = []
+        for name, members in signature.items():
+            places[name] = range(len(dtypes), len(dtypes) + len(members))
+            dtypes += members
         carry_count = len(places["carry"])
-        dtypes = [spec.dtype for spec in signature]
         types = [_MEMORY_TYPES[str(dtype)] for dtype in dtypes]
-        if any(dtypes[i].kind != "f" for i in (*places["value"], *places["carry"])):
+        if any(dtypes[i].kind != "f" for i in (*places["values"], *places["carry"])):
             raise Unsupported("lanes that carry other numbers than floating-point ones")
         arrays = [build.load(build.gep(table, [_INT(i)], source_etype=_POINTER), typ=_POINTER) for i in range(len(dtypes))]
 
@@ -307,8 +274,8 @@ class _LoopWriter(ScalarWriter):
             first = build.insert_element(undefined, number, ir.IntType(32)(0))
             return build.shuffle_vector(first, undefined, ir.Constant(self.vector_type(ir.IntType(32)), None))
 
-        constants = [broadcast(i, _INT(0)) for i in places["constant"]]
-        final_inputs = [broadcast(i, _INT(0)) for i in places["final input"]]
+        constants = [broadcast(i, _INT(0)) for i in places["constants"]]
+        final_inputs = [broadcast(i, _INT(0)) for i in places["final_inputs"]]
 
         def write_lanes(lane: Vector, _: list[Vector]) -> list[Vector]:
             def read(name: str, index: Vector = lane) -> list[Vector]:
@@ -324,15 +291,15 @@ class _LoopWriter(ScalarWriter):
                     build.store(vector, build.gep(arrays[i], [index], source_etype=types[i]), align=dtypes[i].itemsize)
                 return []
 
-            values = read("value")
+            values = read("values")
             self.invariants = {*values, *constants}
 
             def write_sample(sample: Vector, carry: list[Vector]) -> list[Vector]:
                 index = build.add(build.mul(sample, width), lane)
-                lane_inputs = read("lane's sample input", index)
-                inputs = (broadcast(i, sample) for i in places["sample input"])
+                lane_inputs = read("lane_inputs", index)
+                inputs = (broadcast(i, sample) for i in places["sample_inputs"])
                 results = self.write_jaxpr(body, [*values, *carry, *constants, *inputs, *lane_inputs])
-                write("sample output", results[carry_count:], index)
+                write("outputs", results[carry_count:], index)
                 return results[:carry_count]
 
             def write_block(block_start: Vector, carry: list[Vector]) -> list[Vector]:
@@ -340,10 +307,10 @@ class _LoopWriter(ScalarWriter):
                 last = build.select(build.icmp_signed("<", block_end, steps), block_end, steps)
                 carry = self.write_for(block_start, last, carry, write_sample)
                 block = build.sdiv(block_start, block_length)
-                inputs = (broadcast(i, block) for i in places["block input"])
+                inputs = (broadcast(i, block) for i in places["block_inputs"])
                 results = self.write_jaxpr(hooks.after_block, [*values, *carry, *inputs])
                 index = build.add(build.mul(block, width), lane)
-                write("block flag", results[carry_count:], index)
+                write("flags", results[carry_count:], index)
                 return results[:carry_count]
 
             if hooks.start is None:
@@ -358,7 +325,7 @@ class _LoopWriter(ScalarWriter):
                 return write("carry", carry, lane)
             return self.write_if(
                 ends,
-                lambda: write("result", self.write_jaxpr(hooks.finish, [*values, *carry, *final_inputs]), lane),
+                lambda: write("results", self.write_jaxpr(hooks.finish, [*values, *carry, *final_inputs]), lane),
                 lambda: write("carry", carry, lane),
             )
 

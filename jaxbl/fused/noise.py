@@ -16,7 +16,6 @@ from jax.extend.random import define_prng_impl
 from jaxbl.chain import LONGEST_BLOCK, NamedArrays, unit_noise
 
 from . import Unsupported, raising_unsupported
-from .jaxprs import trace
 from .llvm import Loop
 
 LONGEST_SPAN = 4 * LONGEST_BLOCK
@@ -48,7 +47,7 @@ def _compile_noise(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int
     """A function that draws the noise of at most `size` samples; compiled once for all studies."""
     with jax.default_device(host_device()):
         try:
-            return _compile_noise_by_loop(size) if sides == SIDES else _compile_noise_by_xla(size, sides)
+            return _compile_noise_by_loop(size, sides)
         except Unsupported:
             return _compile_noise_by_xla(size, sides)
 
@@ -62,21 +61,20 @@ def _compile_noise_by_xla(size: int, sides: tuple[str, ...]) -> Callable[[int, i
     return lambda seed, first, count: program(np.uint32(seed), np.int32(first))
 
 
-def _compile_noise_by_loop(size: int) -> Callable[[int, int, int], Any]:
-    """The same by a loop for the random bits. Raises `Unsupported` where JAX draws them in another way."""
+def _compile_noise_by_loop(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
+    """The same by a loop for the random bits. Raises `Unsupported` for other sides, or where JAX draws them otherwise."""
     settings: Any = jax.config
-    if settings.jax_default_prng_impl != "threefry2x32" or not settings.jax_threefry_partitionable:
-        raise Unsupported("random bits by another generator")
+    if sides != SIDES or settings.jax_default_prng_impl != "threefry2x32" or not settings.jax_threefry_partitionable:
+        raise Unsupported("random bits of other sides, or by another generator")
     with raising_unsupported():
         loop = _compile_bits_loop()
         bits = jax.ShapeDtypeStruct((2, size), jnp.uint32)
         program = jax.jit(jax.vmap(jax.vmap(_normal_number))).lower(bits).compile()
 
     def draw(seed: int, first: int, count: int) -> Any:
-        padded = -(-count // loop.lanes) * loop.lanes
-        bits = np.zeros((2, size), np.uint32)
-        samples = np.arange(first, first + padded, dtype=np.uint32)
-        loop([np.array(seed, np.uint32), samples, *bits[:, :padded]], 1, padded)
+        samples, bits = np.arange(first, first + count, dtype=np.uint32), np.zeros((2, size), np.uint32)
+        drawn = loop.run(1, count, constants=[np.array(seed, np.uint32)], lane_inputs=[samples])[1]
+        bits[:, :count] = np.concatenate(drawn)
         return program(bits)
 
     return draw
@@ -84,7 +82,7 @@ def _compile_noise_by_loop(size: int) -> Callable[[int, int, int], Any]:
 
 @cache
 def _compile_bits_loop() -> Loop:
-    return Loop(trace(_random_bits, _WORD, _WORD), np.dtype(np.float32), constants=1, lane_inputs=1)
+    return Loop(jax.make_jaxpr(_random_bits)(_WORD, _WORD), np.dtype(np.float32), constants=1, lane_inputs=1)
 
 
 def _random_bits(seed: Any, index: Any) -> tuple[Any, Any]:

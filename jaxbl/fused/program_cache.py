@@ -15,7 +15,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,14 +24,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import numpy as np
 
 from jaxbl.workers import PROGRAMS_VARIABLE, make_private_folder
 
-from . import Unsupported, raising_unsupported, warn_of_scan
-
-LoopDefinition = tuple[Callable[..., Any], Sequence[Any], dict[str, Any]]
-"""A function of one sample, examples of its arguments, and options of its :class:`jaxbl.fused.llvm.Loop`."""
 _DEPENDENCIES = "equinox", "jax", "jaxlib", "llvmlite", "numpy"
 _UNUSED_DAYS = 30.0
 """Days after which programs of another version of the package are deleted, if nothing has used them."""
@@ -119,34 +114,6 @@ def save(key: str | None, program: Any) -> None:
         draft = folder / f"{key}.{os.getpid()}"
         draft.write_bytes(pickle.dumps(program))
         draft.replace(folder / key)
-
-
-def compile_once(define: Callable[..., LoopDefinition]) -> Any:
-    """Make a function that returns the defined loop of float64 for some arguments: compiled once, or loaded.
-
-    It returns None, with a message, where the loop is not supported. Of an argument that has them, `examples` are described.
-    """
-
-    @functools.lru_cache(maxsize=64)
-    @functools.wraps(define)
-    def compile_loop(*arguments: Any) -> Any:
-        key = program_key("loop", define, *(getattr(argument, "examples", argument) for argument in arguments))
-        if (loop := load(key)) is not None:
-            return loop
-        try:
-            with raising_unsupported(), jax.enable_x64(True):
-                from .jaxprs import trace
-                from .llvm import Loop
-
-                sample, examples, options = define(*arguments)
-                loop = Loop(trace(sample, *examples), np.dtype(float), **options)
-                save(key, loop)
-                return loop
-        except Unsupported as reason:
-            warn_of_scan(str(reason))
-            return None
-
-    return compile_loop
 
 
 def _describe(argument: Any) -> str:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import Leaves, Unsupported
-from .dependence import LoopHooks, split_by_state
+from .dependence import Dependence, LoopHooks, split_by_lane
 from .jaxprs import trace_inlined
 from .llvm import Loop
 from .noise import LONGEST_SPAN, draw_noise
@@ -88,11 +88,15 @@ class SharedPartLoop:
     """
 
     def __init__(self, part: SharedPart):
-        split = split_by_state(part.step, part.state, part.input_shapes())
-        self._part, self._is_stateless = part, split.is_stateless
+        # what needs the state stands in the part of lanes
+        needing = [Dependence.LANE] * len(part.state)
+        split = split_by_lane(
+            lambda _, state, inputs: part.step(state, inputs), [], part.state, part.input_shapes(), needing, needing
+        )
+        self._part, self._needs_state = part, split.is_lane_result[len(part.state) :]
         # one program for all spans: what it computes beyond the last sample is not read. Numbers of one type are stacked,
         # as each array takes XLA and NumPy some microseconds
-        inputs, compute_stateless = part.input_shapes(part.span_length), jax.vmap(split.compute_stateless)
+        inputs, compute_stateless = part.input_shapes(part.span_length), jax.vmap(lambda inputs: split.shared((), inputs))
         dtypes = [leaf.dtype for leaf in jax.tree.leaves(jax.eval_shape(compute_stateless, inputs))]
         self._groups = [[i for i, other in enumerate(dtypes) if other == dtype] for dtype in dict.fromkeys(dtypes)]
 
@@ -102,14 +106,11 @@ class SharedPartLoop:
 
         self._compute_stacked = jax.jit(compute_stacked).lower(inputs).compile()
         self._loop = None
-        self._block_dtypes: list[np.dtype] = []
-        self._sample_dtypes: list[np.dtype] = []
         if part.state:
-            end_block = trace_inlined(lambda *state: jax.tree.leaves(part.end_block(state, ())), *part.state)
-            count = len(part.state)
-            self._block_dtypes = [out.dtype for out in end_block.out_avals[count:]]
-            self._sample_dtypes = [out.dtype for out in split.step.out_avals[count:]]
-            self._loop = Loop(split.step, np.dtype(float), carry=count, hooks=LoopHooks(after_block=end_block), lanes=1)
+            hooks = LoopHooks(
+                after_block=trace_inlined(lambda *state: jax.tree.leaves(part.end_block(state, ())), *part.state)
+            )
+            self._loop = Loop(split.lane, np.dtype(float), carry=len(part.state), hooks=hooks, lanes=1)
 
     def __call__(self, state: Leaves, seed: int, first: int, count: int) -> SharedValues:
         part = self._part
@@ -117,18 +118,16 @@ class SharedPartLoop:
         columns: dict[int, np.ndarray] = {}
         for group, rows in zip(self._groups, stacks, strict=True):
             columns |= zip(group, np.asarray(rows)[:, :count], strict=True)
-        stateless_count = sum(self._is_stateless)
-        stateless = iter([columns[i] for i in range(stateless_count)])
-        loop_inputs = [columns[i] for i in range(stateless_count, len(columns))]
-        state = [np.array([leaf]) for leaf in state]
-        block_outputs = [np.empty(-(-count // part.block_length), dtype) for dtype in self._block_dtypes]
-        loop_outputs = [np.empty(count, dtype) for dtype in self._sample_dtypes]
+        stateless_count, ordered = self._needs_state.count(False), [columns[i] for i in range(len(columns))]
+        stateless, loop_inputs = iter(ordered[:stateless_count]), ordered[stateless_count:]
+        found = (), (), ()
         if self._loop is not None:
-            arrays = [*state, *loop_inputs, *loop_outputs, *block_outputs]
-            self._loop(arrays, count, 1, block_length=part.block_length)
+            carry = [np.array([leaf]) for leaf in state]
+            found = self._loop.run(count, block_length=part.block_length, carry=carry, sample_inputs=loop_inputs)
+        state, loop_outputs, block_outputs = ([column[..., 0] for column in columns] for columns in found)
         stateful = iter(loop_outputs)
-        sample_outputs = [next(stateless) if is_stateless else next(stateful) for is_stateless in self._is_stateless]
-        return [leaf[0] for leaf in state], block_outputs, sample_outputs
+        sample_outputs = [next(stateful if needs_state else stateless) for needs_state in self._needs_state]
+        return state, block_outputs, sample_outputs
 
 
 def compile_shared_part(part: SharedPart) -> SharedPartLoop | SharedPartScan:

@@ -1,18 +1,15 @@
 """Scan a function of a sample's scalars along a signal, by a loop for this machine's processor: one loop for all lengths."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from . import Arrays, Leaves, program_cache
+from . import ArrayGroup, Arrays, Leaves
+from .compiled_loop import NUMBER, LoopDefinition, compile_once
 
 SampleFunction = Callable[[Leaves, Leaves, Leaves], tuple[Leaves, Leaves]]
 """From values, carry and a sample's inputs to the next carry and the sample's outputs."""
-_NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 
 
 def scan_signal(
@@ -29,36 +26,36 @@ def scan_signal(
     Returns:
         The outputs of the function, each of shape (samples, lanes).
     """
-    lanes, samples = len(carry[0]), len(inputs[0])
-    inputs = [column[:, 0] if lanes == 1 and column.ndim == 2 else column for column in map(np.asarray, inputs)]
-    loop = _compile_loop(sample, len(values), len(carry), len(inputs), lanes == 1, inputs[0].ndim == 2)
-    if loop is None:
-        with jax.enable_x64(True):
-            arguments = [[jnp.asarray(column, float) for column in columns] for columns in (values, carry, inputs)]
-            return [np.asarray(column) for column in _scan_by_xla(sample, *arguments)]
-    width = -(-lanes // loop.lanes) * loop.lanes
-    padding = (0, width - lanes)
-    lane_columns = [np.pad(np.asarray(column, float), padding, "edge") for column in (*values, *carry)]
-    padded_inputs = [
-        np.ascontiguousarray(column if column.ndim == 1 else np.pad(column, ((0, 0), padding)), float) for column in inputs
-    ]
-    outputs = [np.empty((samples, width)) for spec in loop.signature if spec.name.startswith("sample output")]
-    loop([*lane_columns, *padded_inputs, *outputs], samples, width)
-    return [output[:, :lanes] for output in outputs]
+    columns = [column[:, 0] if len(carry[0]) == 1 and column.ndim == 2 else column for column in map(np.asarray, inputs)]
+    groups = (columns, ()) if columns[0].ndim == 1 else ((), columns)
+    return [*advance_signal(sample, values, carry, *groups)[1]]
 
 
-@program_cache.compile_once
+def advance_signal(
+    sample: SampleFunction, values: Any, carry: Any, shared_inputs: Any, lane_inputs: Any
+) -> tuple[ArrayGroup, ArrayGroup]:
+    """The same with inputs of both kinds: those of each sample, `(samples,)`, come before those of each sample and lane,
+    `(samples, lanes)`. All may be lists of arrays, or rows of one array.
+
+    Returns:
+        The carry after the last sample, and the outputs.
+    """
+    groups = [np.asarray(group, float) for group in (values, carry, shared_inputs, lane_inputs)]
+    lanes, samples = groups[1].shape[1], (groups[2] if len(shared_inputs) else groups[3]).shape[1]
+    loop = _compile_loop(sample, *map(len, groups), lanes == 1)
+    names = "values", "carry", "sample_inputs", "lane_inputs"
+    carry, outputs, _ = loop.run(samples, lanes, **dict(zip(names, map(np.ascontiguousarray, groups), strict=True)))
+    return carry, outputs
+
+
+@compile_once
 def _compile_loop(
-    sample: SampleFunction, values: int, carry: int, inputs: int, has_single_lane: bool, has_lane_inputs: bool
-) -> Any:
-    """The loop for these numbers of arguments; None if it is not supported."""
-    lanes, lane_inputs = 1 if has_single_lane else None, inputs if has_lane_inputs else 0
-    examples = [[_NUMBER] * size for size in (values, carry, inputs)]
-    return sample, examples, {"values": values, "carry": carry, "lane_inputs": lane_inputs, "lanes": lanes}
+    sample: SampleFunction, values: int, carry: int, shared_inputs: int, lane_inputs: int, has_single_lane: bool
+) -> LoopDefinition:
+    """The loop for these numbers of arguments."""
 
+    def advance(values: Leaves, carry: Leaves, shared_inputs: Leaves, lane_inputs: Leaves) -> tuple[Leaves, Leaves]:
+        return sample(values, carry, [*shared_inputs, *lane_inputs])
 
-@partial(jax.jit, static_argnums=0)
-def _scan_by_xla(
-    sample: SampleFunction, values: list[jax.Array], carry: list[jax.Array], inputs: list[jax.Array]
-) -> list[jax.Array]:
-    return jax.lax.scan(lambda carry, inputs: sample(values, carry, inputs), carry, inputs)[1]
+    counts = {"values": values, "carry": carry, "sample_inputs": shared_inputs, "lane_inputs": lane_inputs}
+    return advance, {group: [NUMBER] * count for group, count in counts.items()}, 1 if has_single_lane else None

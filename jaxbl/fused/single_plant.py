@@ -10,9 +10,7 @@ from functools import lru_cache
 from itertools import compress
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbl.chain import (
@@ -21,16 +19,15 @@ from jaxbl.chain import (
     begin_sample,
     correct_by_readings,
     move_plant,
-    plant_trajectory,
 )
-from jaxbl.drive.parameters import get_leaf, set_leaves
+from jaxbl.drive.parameters import get_leaf
 from jaxbl.drive.plant import PlantState
 from jaxbl.workers import map_in_threads
 
-from . import Leaves, program_cache
+from . import Leaves
+from .compiled_loop import NUMBER, LoopDefinition, compile_once
 
 _FLOAT = np.dtype(float)
-_NUMBER = jax.ShapeDtypeStruct((), _FLOAT)
 _UNREADABLE = object()
 """In place of leaves that are no numbers, such as tables: loops are not compiled where a step reads one."""
 
@@ -103,11 +100,10 @@ class PlantSimulator:
     """
 
     def __init__(self, experiment: Experiment, state: PlantState, varied: Sequence[str], sides: Iterable[str]):
-        self.experiment, self.varied, self.sides = experiment, tuple(varied), tuple(sorted(sides))
+        self.varied, self.sides = tuple(varied), tuple(sorted(sides))
         structure = _PlantStructure.of(experiment, state)
-        self.loop = _trajectory_loop(structure, self.sides)
-        if self.loop is not None:
-            self.numbers, self.places = structure.read_numbers(experiment), list(_find_places(structure, self.varied))
+        self.loop, self.places = _trajectory_loop(structure, self.sides), list(_find_places(structure, self.varied))
+        self.numbers, self.tables = structure.split_leaves(experiment)
 
     def __call__(
         self,
@@ -119,30 +115,22 @@ class PlantSimulator:
         gain: NamedArrays,
     ) -> PlantState:
         """Simulate with these values of the varied numbers; other arguments as for :func:`simulate_plants`."""
-        if self.loop is None:
-            experiment = set_leaves(self.experiment, {path: np.asarray(values[path], float) for path in self.varied})
-            arguments = starts, torque, time, dict(measured)
-            runs = [jax.tree.map(lambda x, i=i: jnp.asarray(x[i], float), arguments) for i in range(len(torque))]
-            states = [_simulate_by_xla(experiment, *run, gain) for run in runs]  # pyright: ignore[reportCallIssue]
-            return jax.tree.map(lambda *x: np.stack(x), *states)
-        from .llvm import ArrayRows
-
         numbers = self.numbers.copy()
         numbers[self.places] = [values[path] for path in self.varied]
         # of each sample, torque first
         columns = [np.ascontiguousarray(column, float) for column in (torque, *(measured[side] for side in self.sides))]
         gains = [gain[side] for side in self.sides]
-        leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(starts)]
-        states, index = [np.empty(torque.shape) for _ in leaves], np.arange(torque.shape[1], dtype=np.int32)
+        leaves, structure = jax.tree.flatten(starts)
+        index = np.arange(torque.shape[1], dtype=np.int32)
 
-        def simulate_run(i: int) -> None:
-            carry = [np.array([leaf[i]]) for leaf in leaves]
-            constants = ArrayRows(np.concatenate([numbers, time[i : i + 1], *gains]))
-            columns_of_run = (column[i] for column in (*columns, *states))
-            self.loop([*carry, constants, index, *columns_of_run], len(index), 1)
+        def simulate_run(i: int) -> np.ndarray:
+            carry = [np.asarray(leaf[i : i + 1], float) for leaf in leaves]
+            constants, inputs = np.concatenate([numbers, time[i : i + 1], *gains]), [column[i] for column in columns]
+            groups = {"carry": carry, "constants": constants, "sample_inputs": [index, *inputs]}
+            return self.loop.run(len(index), **groups, tables=self.tables)[1]
 
-        map_in_threads(simulate_run, range(len(torque)))
-        return jax.tree.structure(starts).unflatten(states)
+        runs = map_in_threads(simulate_run, range(len(torque)))
+        return structure.unflatten(np.stack(rows)[..., 0] for rows in zip(*runs, strict=True))
 
 
 def step_derivatives(
@@ -165,58 +153,19 @@ def step_derivatives(
     """
     structure, leaves = _PlantStructure.of(experiment, states), jax.tree.leaves(states)
     loop = _derivatives_loop(structure)
-    if loop is None:
-        # numbers as arrays: one program for all directions
-        zeros, arguments = jax.tree.map(np.zeros_like, experiment), (states, torque, time)
-        derivatives = []
-        for direction in directions:
-            change = np.array(direction.state, float) if direction.state else np.zeros(len(leaves))
-            numbers = {path: np.asarray(number, float) for path, number in direction.numbers.items()}
-            state = jax.tree.structure(states).unflatten(change)
-            tangent = set_leaves(zeros, numbers), state, np.asarray(direction.torque, float)
-            arrays = jax.tree.map(jnp.asarray, (*arguments, tangent))
-            derivatives.append(_derivatives_by_xla(experiment, *arrays))  # pyright: ignore[reportCallIssue]
-        changes, new = [jax.tree.leaves(change) for change, _ in derivatives], jax.tree.leaves(derivatives[0][1])
-        return np.array(changes, float), np.array(new, float)
-    from .llvm import ArrayRows
+    width = loop.whole_vectors(len(torque))
+    values = np.pad(np.stack([*leaves, torque, time], dtype=float), ((0, 0), (0, width - len(torque))), "edge")
+    (numbers, tables), tangents = structure.split_leaves(experiment), structure.stack_tangents(directions)
 
-    count = len(torque)
-    width = -(-count // loop.lanes) * loop.lanes
-    values = [np.pad(np.asarray(column, float), (0, width - count), "edge") for column in (*leaves, torque, time)]
-    numbers, tangents = structure.read_numbers(experiment), structure.stack_tangents(directions)
-    changes, new = np.empty((len(tangents), len(leaves), width)), np.empty((len(leaves), width))
+    def differentiate(first: int) -> np.ndarray:
+        constants = np.concatenate([numbers, *tangents[first : first + _TOGETHER]])
+        # changes along each direction, then the new state, which is the same for all
+        _, found, _ = loop.run(1, width, values=values, constants=constants, tables=tables)
+        return found.reshape(_TOGETHER + 1, len(leaves), width)
 
-    def differentiate(first: int) -> None:
-        together = slice(first, first + _TOGETHER)
-        tangent, change = tangents[together].ravel(), changes[together].reshape(-1, width)
-        # all write the same new state
-        loop([*values, ArrayRows(numbers), ArrayRows(tangent), ArrayRows(change), ArrayRows(new)], 1, width)
-
-    map_in_threads(differentiate, range(0, len(tangents), _TOGETHER))
-    return changes[: len(directions), :, :count], new[:, :count]
-
-
-_simulate_by_xla = eqx.filter_jit(plant_trajectory)
-
-
-@eqx.filter_jit
-def _derivatives_by_xla(
-    experiment: Experiment,
-    states: PlantState,
-    torque: jax.Array,
-    time: jax.Array,
-    tangent: tuple[Experiment, PlantState, jax.Array],
-) -> tuple[PlantState, PlantState]:
-    def differentiate(state: PlantState, torque: jax.Array, time: jax.Array) -> tuple[PlantState, PlantState]:
-        def step(experiment: Experiment, state: PlantState, torque: jax.Array) -> PlantState:
-            return move_plant(experiment.plant, experiment.run, state, torque, time)
-
-        primals = experiment, state, torque
-        tangents = jax.tree.map(lambda x, change: jnp.broadcast_to(change, x.shape).astype(x.dtype), primals, tangent)
-        new, change = jax.jvp(step, primals, tangents)
-        return change, new
-
-    return jax.vmap(differentiate)(states, torque, time)
+    found = map_in_threads(differentiate, range(0, len(tangents), _TOGETHER))
+    changes = np.concatenate([rows[:-1] for rows in found])
+    return changes[: len(directions), :, : len(torque)], found[0][-1, :, : len(torque)]
 
 
 class _PlantStructure(NamedTuple):
@@ -241,17 +190,19 @@ class _PlantStructure(NamedTuple):
     @property
     def examples(self) -> tuple[Any, Any]:
         """Experiment and state, with types in place of numbers."""
-        leaves = [_NUMBER if is_number else None for is_number in self.is_number]
-        return self.experiment_tree.unflatten(leaves), self.state_tree.unflatten([_NUMBER] * self.state_tree.num_leaves)
+        leaves = [NUMBER if is_number else None for is_number in self.is_number]
+        return self.experiment_tree.unflatten(leaves), self.state_tree.unflatten([NUMBER] * self.state_tree.num_leaves)
 
     @property
     def number_examples(self) -> Leaves:
         """Types of the numbers of an experiment."""
-        return [_NUMBER] * sum(self.is_number)
+        return [NUMBER] * sum(self.is_number)
 
-    def read_numbers(self, experiment: Experiment) -> np.ndarray:
-        """The numbers of an experiment."""
-        return np.array([np.asarray(leaf) for leaf in compress(jax.tree.leaves(experiment), self.is_number)], float)
+    def split_leaves(self, experiment: Experiment) -> tuple[np.ndarray, Leaves]:
+        """The numbers of an experiment, and its other leaves."""
+        leaves = jax.tree.leaves(experiment)
+        tables = [leaf for leaf, is_number in zip(leaves, self.is_number, strict=True) if not is_number]
+        return np.array([np.asarray(leaf) for leaf in compress(leaves, self.is_number)], float), tables
 
     def stack_tangents(self, directions: Sequence[Direction]) -> np.ndarray:
         """Directions as rows: changes of the numbers, of the state's leaves, of the input."""
@@ -267,10 +218,11 @@ class _PlantStructure(NamedTuple):
             row[-1] = direction.torque
         return tangents
 
-    def build_experiment(self, numbers: Sequence[Any]) -> Experiment:
-        """The experiment from its numbers; what reads another leaf fails."""
-        remaining = iter(numbers)
-        return self.experiment_tree.unflatten(next(remaining) if is_number else _UNREADABLE for is_number in self.is_number)
+    def build_experiment(self, numbers: Sequence[Any], tables: Sequence[Any]) -> Experiment:
+        """The experiment from its leaves; without tables, what reads one fails."""
+        left, left_tables = iter(numbers), iter(tables)
+        leaves = (next(left) if is_number else next(left_tables, _UNREADABLE) for is_number in self.is_number)
+        return self.experiment_tree.unflatten(leaves)
 
     def step(self, experiment: Experiment, state: Sequence[Any], torque: Any, time: Any) -> Leaves:
         """Leaves of the plant's state one sample later."""
@@ -285,13 +237,13 @@ def _find_places(structure: _PlantStructure, paths: tuple[str, ...]) -> tuple[in
     return tuple(get_leaf(places, path) for path in paths)
 
 
-@program_cache.compile_once
-def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = ()) -> Any:
+@compile_once
+def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = ()) -> LoopDefinition:
     """The loop from state, numbers, first time and gains, and a sample's index, torque and readings."""
 
-    def sample(state: Leaves, numbers: Leaves, start: Any, gains: Leaves, index: Any, inputs: Leaves) -> Any:
-        torque, *readings = inputs
-        experiment = structure.build_experiment(numbers)
+    def sample(state: Leaves, constants: Any, inputs: Leaves, tables: Leaves = ()) -> tuple[Leaves, Leaves]:
+        (numbers, start, gains), (index, torque, *readings) = constants, inputs
+        experiment = structure.build_experiment(numbers, tables)
         gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
         plant_state = correct_by_readings(
             structure.state_tree.unflatten(state), dict(zip(sides, readings, strict=True)), gain
@@ -300,23 +252,24 @@ def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = ()) ->
         return structure.step(experiment, jax.tree.leaves(plant_state), torque, time), state
 
     count = structure.state_tree.num_leaves
-    constants = structure.number_examples, _NUMBER, [_NUMBER] * (2 * len(sides))
-    index, inputs = jax.ShapeDtypeStruct((), np.int32), [_NUMBER] * (1 + len(sides))
-    examples = [_NUMBER] * count, *constants, index, inputs
-    return sample, examples, {"carry": count, "lanes": 1, "constants": len(jax.tree.leaves(constants))}
+    constants = structure.number_examples, NUMBER, [NUMBER] * (2 * len(sides))
+    inputs = [jax.ShapeDtypeStruct((), np.int32), *[NUMBER] * (1 + len(sides))]
+    return sample, {"carry": [NUMBER] * count, "constants": constants, "sample_inputs": inputs}, 1
 
 
 _TOGETHER = 2
 """Directions of one loop, which take the step itself but once: 0.6 of the time. More take too long to compile."""
 
 
-@program_cache.compile_once
-def _derivatives_loop(structure: _PlantStructure) -> Any:
+@compile_once
+def _derivatives_loop(structure: _PlantStructure) -> LoopDefinition:
     """The loop from a lane's state, torque and time, from numbers, and from tangents of numbers, state and torque."""
 
-    def differentiate(start: Leaves, torque: Any, time: Any, numbers: Leaves, tangents: Any) -> tuple[Leaves, Leaves]:
+    def differentiate(values: Any, constants: Any, tables: Leaves = ()) -> tuple[Leaves, Leaves]:
+        (start, torque, time), (numbers, tangents) = values, constants
+
         def begin(numbers: Leaves, start: Leaves, torque: Any) -> tuple[PlantState, Any]:
-            experiment = structure.build_experiment(numbers)
+            experiment = structure.build_experiment(numbers, tables)
             return begin_sample(experiment.plant, experiment.run, structure.state_tree.unflatten(start), torque, time)
 
         def advance(index: Any, carry: tuple[Leaves, list[Leaves]]) -> tuple[Leaves, list[Leaves]]:
@@ -327,14 +280,12 @@ def _derivatives_loop(structure: _PlantStructure) -> Any:
             return _linearise(substep, (carry[0], numbers, start, torque), changed)
 
         begun = _linearise(lambda *sample: jax.tree.leaves(begin(*sample)[0]), (numbers, start, torque), tangents)
-        new, changes = jax.lax.fori_loop(0, structure.build_experiment(numbers).run.substeps, advance, begun)
+        new, changes = jax.lax.fori_loop(0, structure.build_experiment(numbers, tables).run.substeps, advance, begun)
         return jax.tree.leaves(changes), new
 
-    count = structure.state_tree.num_leaves
-    state, numbers = [_NUMBER] * count, structure.number_examples
-    examples = state, _NUMBER, _NUMBER, numbers, [(numbers, state, _NUMBER)] * _TOGETHER
-    constants = len(jax.tree.leaves(examples[3:]))
-    return differentiate, examples, {"values": count + 2, "constants": constants}
+    state, numbers = [NUMBER] * structure.state_tree.num_leaves, structure.number_examples
+    constants = numbers, [(numbers, state, NUMBER)] * _TOGETHER
+    return differentiate, {"values": (state, NUMBER, NUMBER), "constants": constants}, None
 
 
 def _linearise(function: Any, primals: tuple[Any, ...], tangents: Sequence[Any]) -> tuple[Leaves, list[Leaves]]:

@@ -82,6 +82,4 @@ def _call_once(function: Callable[..., Any], *numbers: Any) -> Leaves:
         loop = Loop(closed, np.dtype(float), values=len(numbers), lanes=1)
     except Unsupported:
         return [np.asarray(x) for x in jax.tree.leaves(jax.jit(function)(*numbers))]
-    outputs = [np.empty(1, aval.dtype) for aval in closed.out_avals]
-    loop([*(np.array([number]) for number in numbers), *outputs], 1, 1)
-    return [output[0] for output in outputs]
+    return [output[0, 0] for output in loop.run(1, values=[*map(np.array, numbers)])[1]]

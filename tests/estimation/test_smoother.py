@@ -1,8 +1,11 @@
+import inspect
+
 import numpy as np
 import pytest
 
 from jaxbl.estimation.smoother import smooth, smoothed_accelerations
 from jaxbl.fused import signal_scan
+from jaxbl.fused.compiled_loop import ScannedLoop
 
 PERIOD, NOISE, JERK = 2e-3, 1e-4, 3e3
 F = np.array([[1.0, PERIOD, 0.5 * PERIOD**2], [0.0, 1.0, PERIOD], [0.0, 0.0, 1.0]])
@@ -122,7 +125,12 @@ def test_quantised_readings():
 @pytest.mark.parametrize(("columns", "machine_code"), [(1, True), (3, True), (21, True), (3, False)])
 def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monkeypatch):
     if not machine_code:
-        monkeypatch.setattr(signal_scan, "_compile_loop", lambda *_: None)
+        define = inspect.unwrap(signal_scan._compile_loop)
+
+        def scanned_loop(*sizes):
+            return ScannedLoop(*define(*sizes)[:2])
+
+        monkeypatch.setattr(signal_scan, "_compile_loop", scanned_loop)
     readings = np.stack([(1.0 + seed) * simulate_motion(seed, 300)[1] for seed in range(columns)], axis=1)
     result = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
     for channel, position in zip(result.T, readings.T, strict=True):

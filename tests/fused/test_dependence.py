@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbl.fused.dependence import Dependence, find_carry_dependences, split_by_lane, split_by_state
+from jaxbl.fused.dependence import Dependence, find_carry_dependences, split_by_lane
 
 
 def begin(values):
@@ -66,20 +66,21 @@ def test_a_recursion_leaves_what_needs_no_state_to_be_done_at_once():
 
     state = [jnp.asarray(0.2), jnp.asarray(-0.1)]
     inputs = jnp.arange(9), jnp.linspace(-0.5, 0.5, 9)
-    parts = split_by_state(sample, state, jax.tree.map(lambda x: x[0], inputs))
-    assert parts.is_stateless == [True, False, True, False]
+    first_inputs, needing = jax.tree.map(lambda x: x[0], inputs), [Dependence.LANE] * 2
+    parts = split_by_lane(lambda _, state, inputs: sample(state, inputs), [], state, first_inputs, needing, needing)
+    assert parts.is_lane_result == [True, True, False, True, False, True]
     # neither the table nor a sine is left to the loop
-    assert not {eqn.primitive.name for eqn in parts.step.jaxpr.eqns} & {"sin", "gather", "rem"}
-    stateless_outputs, loop_inputs = jax.vmap(parts.compute_stateless)(inputs)
+    assert not {eqn.primitive.name for eqn in parts.lane.jaxpr.eqns} & {"sin", "gather", "rem"}
+    stateless_outputs, loop_inputs = jax.vmap(lambda inputs: parts.shared((), inputs))(inputs)
     last, handed = jax.lax.scan(sample, state, inputs)
     for i in range(9):
         step_outputs = jax.core.eval_jaxpr(
-            parts.step.jaxpr, parts.step.consts, *state, *(column[i] for column in loop_inputs)
+            parts.lane.jaxpr, parts.lane.consts, *state, *(column[i] for column in loop_inputs)
         )
         state, outputs = (
             step_outputs[:2],
-            {True: iter(column[i] for column in stateless_outputs), False: iter(step_outputs[2:])},
+            {False: iter(column[i] for column in stateless_outputs), True: iter(step_outputs[2:])},
         )
-        for is_stateless, output in zip(parts.is_stateless, handed, strict=True):
-            np.testing.assert_allclose(next(outputs[is_stateless]), output[i], rtol=1e-6)
+        for needs_state, output in zip(parts.is_lane_result[2:], handed, strict=True):
+            np.testing.assert_allclose(next(outputs[needs_state]), output[i], rtol=1e-6)
     np.testing.assert_allclose(state, last, rtol=1e-6)

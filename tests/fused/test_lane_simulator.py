@@ -279,11 +279,11 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
         assert len(simulator._pools) == threads
         loop = simulator._loop
 
-        def count_samples(arrays, upto, last, loop=loop, **options):
-            samples.append((upto - options.get("start", 0)) * last)
-            loop(arrays, upto, last, **options)
+        def count_samples(arrays, end, loop=loop, **options):
+            samples.append((end - options.get("start", 0)) * arrays.lanes)
+            loop(arrays, end, **options)
 
-        count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
+        count_samples.signature, count_samples.whole_vectors = loop.signature, loop.whole_vectors
         monkeypatch.setattr(simulator, "_loop", count_samples)
         for order in orders:
             samples.clear()
@@ -325,12 +325,12 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
         simulator = HostSimulator(full_experiment, (convergence_reducer,), tuple(values), lanes, threads)
         loop = simulator._loop
 
-        def count_samples(arrays, upto, last, loop=loop, **options):
-            if upto > options.get("start", 0):
-                samples.append(last)
-            loop(arrays, upto, last, **options)
+        def count_samples(arrays, end, loop=loop, **options):
+            if end > options.get("start", 0):
+                samples.append(arrays.lanes)
+            loop(arrays, end, **options)
 
-        count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
+        count_samples.signature, count_samples.whole_vectors = loop.signature, loop.whole_vectors
         monkeypatch.setattr(simulator, "_loop", count_samples)
         samples.clear()
         actual = simulator(values, 3)

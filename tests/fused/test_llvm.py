@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxbl.fused.jaxprs import trace_inlined
-from jaxbl.fused.llvm import ArrayRows, Loop, LoopArrays
+from jaxbl.fused.llvm import Loop, LoopArrays
 
 NUMBER, INDEX = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((), np.int32)
 
@@ -31,29 +31,25 @@ def sum_loop():
 
 def loop_buffers():
     return {
-        "value 0": np.array([1.0, 2.0]),
-        "carry 0": np.zeros(2),
-        "constant 0": np.array(10.0),
-        "sample input 0": np.arange(5, dtype=np.int32),
-        "sample input 1": np.arange(5.0),
-        "sample output 0": np.empty(10),
+        "values": [np.array([1.0, 2.0])],
+        "carry": [np.zeros(2)],
+        "constants": [np.array(10.0)],
+        "sample_inputs": [np.arange(5, dtype=np.int32), np.arange(5.0)],
+        "outputs": [np.empty(10)],
     }
 
 
+def run_loop(loop, groups):
+    loop(LoopArrays(loop.signature, groups, 5, 2), 5)
+
+
 def test_a_loop_says_what_it_takes(sum_loop):
-    assert [arg.name for arg in sum_loop.signature] == list(loop_buffers())
-    assert [arg.extent for arg in sum_loop.signature] == [
-        "lanes",
-        "lanes",
-        "scalar",
-        "samples",
-        "samples",
-        "samples and lanes",
-    ]
     inputs = loop_buffers()
-    sum_loop(list(inputs.values()), 5, 2)
-    np.testing.assert_array_equal(inputs["carry 0"], [110.0, 120.0])
-    np.testing.assert_array_equal(inputs["sample output 0"].reshape(5, 2)[2], [33.0, 36.0])
+    types = {name: [array.dtype for array in arrays] for name, arrays in inputs.items()}
+    assert {name: members for name, members in sum_loop.signature.items() if members} == types
+    run_loop(sum_loop, inputs)
+    np.testing.assert_array_equal(inputs["carry"][0], [110.0, 120.0])
+    np.testing.assert_array_equal(inputs["outputs"][0].reshape(5, 2)[2], [33.0, 36.0])
 
 
 BAD_BUFFERS = {
@@ -64,36 +60,52 @@ BAD_BUFFERS = {
 }
 
 
-@pytest.mark.parametrize("name", loop_buffers())
+@pytest.mark.parametrize(
+    ("name", "place"), [(name, i) for name, arrays in loop_buffers().items() for i in range(len(arrays))]
+)
 @pytest.mark.parametrize("wrong", BAD_BUFFERS)
-def test_what_does_not_fit_is_refused(sum_loop, name, wrong):
+def test_what_does_not_fit_is_refused(sum_loop, name, place, wrong):
     inputs = loop_buffers()
-    inputs[name] = BAD_BUFFERS[wrong](inputs[name])
-    with pytest.raises(ValueError, match=rf"^{name} of a loop needs \d+ contiguous numbers of type"):
-        sum_loop(list(inputs.values()), 5, 2)
+    inputs[name][place] = BAD_BUFFERS[wrong](inputs[name][place])
+    with pytest.raises(ValueError, match=rf"^{name} of a loop: \d+ contiguous numbers of type"):
+        run_loop(sum_loop, inputs)
 
 
-def test_arrays_serve_no_more_samples_and_lanes_than_they_were_made_for(sum_loop):
-    loop_arrays = LoopArrays(sum_loop.signature, list(loop_buffers().values()), 5, 2)
-    with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
-        sum_loop(loop_arrays, 6, 2)
-    with pytest.raises(ValueError, match="arrays were made for 5 and 2"):
-        sum_loop(loop_arrays, 5, 4)
-    with pytest.raises(ValueError, match="needs 6 arrays, not 5"):
-        sum_loop(list(loop_buffers().values())[:-1], 5, 2)
+def test_a_group_that_is_not_full_is_refused(sum_loop):
+    inputs = loop_buffers()
+    with pytest.raises(ValueError, match="a loop needs 2 sample_inputs, not 1"):
+        run_loop(sum_loop, inputs | {"sample_inputs": inputs["sample_inputs"][:1]})
+    with pytest.raises(ValueError, match="a loop needs 1 outputs, not 0"):
+        run_loop(sum_loop, {name: arrays for name, arrays in inputs.items() if name != "outputs"})
+
+
+def test_arrays_serve_no_more_samples_than_they_were_made_for(sum_loop):
+    loop_arrays = LoopArrays(sum_loop.signature, loop_buffers(), 5, 2)
+    with pytest.raises(ValueError, match="samples 0 to 6: not of 5 in blocks of 5"):
+        sum_loop(loop_arrays, 6)
+    with pytest.raises(ValueError, match="samples 2 to 5: not of 5 in blocks of 5"):
+        sum_loop(loop_arrays, 5, start=2)
 
 
 def test_rows_of_one_array_stand_for_several(sum_loop):
     inputs = loop_buffers()
-    stacked = np.array([inputs["value 0"], inputs["carry 0"]])
-    other_buffers = list(inputs.values())[2:]
-    sum_loop([ArrayRows(stacked), *other_buffers], 5, 2)
+    stacked = np.array([inputs["values"][0], inputs["carry"][0]])
+    run_loop(sum_loop, inputs | {"values": stacked[:1], "carry": stacked[1:]})
     np.testing.assert_array_equal(stacked, [[1.0, 2.0], [110.0, 120.0]])
-    with pytest.raises(ValueError, match="sample input 0 of a loop needs 5 contiguous numbers of type int32"):
-        sum_loop([ArrayRows(stacked), other_buffers[0], ArrayRows(np.zeros((2, 5))), other_buffers[3]], 5, 2)
-    with pytest.raises(ValueError, match="constant 0 of a loop is no row of one array"):
-        sum_loop([ArrayRows(np.zeros((3, 2))), *other_buffers[1:]], 5, 2)
-    with pytest.raises(ValueError, match="value 0 of a loop is no row of one array"):
-        sum_loop([ArrayRows(np.zeros((4, 2))[::2]), *other_buffers], 5, 2)
-    with pytest.raises(ValueError, match="needs 6 arrays, not 7"):
-        sum_loop([ArrayRows(np.zeros((3, 2))), *other_buffers], 5, 2)
+    for name, rows in (
+        ("sample_inputs", np.zeros((2, 5))),
+        ("values", np.zeros((1, 4))[:, ::2]),
+        ("carry", np.zeros((1, 3))),
+    ):
+        with pytest.raises(ValueError, match=rf"^{name} of a loop: \d+ contiguous numbers of type"):
+            run_loop(sum_loop, inputs | {name: rows[: len(inputs[name])]})
+
+
+def test_vectors_are_filled_and_nothing_of_it_is_returned(sum_loop):
+    inputs = loop_buffers()
+    inputs |= {"values": [np.array([1.0, 2.0, 3.0])], "carry": np.zeros((1, 3))}
+    del inputs["outputs"]
+    (carry,), (outputs,), flags = sum_loop.run(5, 3, **inputs)
+    np.testing.assert_array_equal(carry, [110.0, 120.0, 130.0])
+    np.testing.assert_array_equal(outputs[2], [33.0, 36.0, 39.0])
+    assert not len(flags) and not inputs["carry"].any()

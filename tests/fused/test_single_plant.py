@@ -14,6 +14,8 @@ from jaxbl.drive import LinearShaft, Rigid, SigmoidBacklash, TwoInertia, as_arra
 from jaxbl.drive.effects import SideEffect, make_effect
 from jaxbl.drive.excitation import Recorded, Sine
 from jaxbl.fused import single_plant as module
+from jaxbl.fused.compiled_loop import ScannedLoop
+from jaxbl.fused.llvm import Loop
 from jaxbl.fused.single_plant import Direction, simulate_plant, step_derivatives
 
 STEPS = 250
@@ -66,7 +68,8 @@ def test_the_path_is_that_of_the_scan(name, observed):
         measured = {side: 0.05 * np.cumsum(rng.normal(0.0, 0.01, STEPS)) for side in model.sides}
         more = {"measured": measured, "gain": {side: np.array([0.3, 20.0 + i]) for i, side in enumerate(model.sides)}}
     expected = eqx.filter_jit(plant_trajectory)(model, start, jnp.asarray(torque), 0.7, **jax.tree.map(jnp.asarray, more))
-    assert module._trajectory_loop(module._PlantStructure.of(model, start), tuple(sorted(more.get("gain", ())))) is not None
+    structure, observed_sides = module._PlantStructure.of(model, start), tuple(sorted(more.get("gain", ())))
+    assert isinstance(module._trajectory_loop(structure, observed_sides), Loop)
     plant = simulate_plant(model, start, torque, 0.7, **more)
     assert jax.tree.structure(plant) == jax.tree.structure(expected)
     for computed, reference in zip(jax.tree.leaves(plant), jax.tree.leaves(expected), strict=True):
@@ -91,7 +94,7 @@ def test_slopes_are_those_of_differences(name):
     time = 1e-3 * np.arange(STEPS)
     states = simulate_plant(model, start, torque)
     tangents = list_directions(model, start)
-    assert module._derivatives_loop(module._PlantStructure.of(model, start)) is not None
+    assert isinstance(module._derivatives_loop(module._PlantStructure.of(model, start)), Loop)
     changes, new = step_derivatives(model, states, torque, time, tangents)
     assert changes.shape == (len(tangents), len(jax.tree.leaves(start)), STEPS)
 
@@ -131,8 +134,8 @@ def test_what_a_loop_cannot_do_is_left_to_the_scan():
     model = make_experiment(["motor.viscous_friction"], extra=(_Tabled(side="motor", table=jnp.linspace(0.0, 1.0, 30)),))
     start, torque, _ = draw_inputs(model)
     plant = module._PlantStructure.of(model, start)
-    assert module._trajectory_loop(plant, ()) is None
-    assert module._derivatives_loop(plant) is None
+    assert isinstance(module._trajectory_loop(plant, ()), ScannedLoop)
+    assert isinstance(module._derivatives_loop(plant), ScannedLoop)
     expected = eqx.filter_jit(plant_trajectory)(model, start, jnp.asarray(torque))
     actual = simulate_plant(model, start, torque)
     for side in model.sides:
@@ -151,8 +154,8 @@ def test_tables_that_no_step_reads_are_no_obstacle():
     start, torque, _ = draw_inputs(model)
     recorded = as_arrays(Recorded(np.arange(3.0), np.arange(3.0)), np.float64)
     other = eqx.tree_at(lambda e: e.excitation, model, recorded)
-    assert module._trajectory_loop(module._PlantStructure.of(other, start), ()) is not None
-    assert module._derivatives_loop(module._PlantStructure.of(other, start)) is not None
+    assert isinstance(module._trajectory_loop(module._PlantStructure.of(other, start), ()), Loop)
+    assert isinstance(module._derivatives_loop(module._PlantStructure.of(other, start)), Loop)
     expected, plant = simulate_plant(model, start, torque), simulate_plant(other, start, torque)
     assert np.array_equal(plant.position["motor"], expected.position["motor"])
     tangents = [list_directions(e, start)[:6] for e in (model, other)]
@@ -167,10 +170,10 @@ def test_columns_of_other_lengths_are_refused():
     model = make_experiment([])
     start, torque, _ = draw_inputs(model)
     states = simulate_plant(model, start, torque)
-    with pytest.raises(ValueError, match="of a loop needs"):
+    with pytest.raises(ValueError, match="must have the same shape"):
         step_derivatives(model, states, torque[:-1], 1e-3 * np.arange(STEPS - 1), list_directions(model, start))
     gain = dict.fromkeys(model.sides, np.array([0.3, 20.0]))
-    with pytest.raises(ValueError, match="of a loop needs"):
+    with pytest.raises(ValueError, match="sample_inputs of a loop: 250 contiguous numbers"):
         simulate_plant(model, start, torque, 0.0, dict.fromkeys(model.sides, torque[:-5]), gain)
 
 
