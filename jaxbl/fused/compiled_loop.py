@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import ArrayGroup, Leaves, Unsupported, program_cache, raising_unsupported, warn_of_scan
+from .dependence import EXTENTS
 
 NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 """An example of a number."""
@@ -45,11 +46,6 @@ def compile_once(define: Callable[..., LoopDefinition]) -> Any:
     return compile_loop
 
 
-_SCANNED = "sample_inputs", "lane_inputs"
-_OF_LANES = "values", "carry", "lane_inputs"
-"""Groups whose numbers differ from sample to sample, and from lane to lane."""
-
-
 class ScannedLoop:
     """A loop by XLA, with those methods of :class:`jaxbl.fused.llvm.Loop` that loops without blocks need.
 
@@ -74,8 +70,9 @@ class ScannedLoop:
         return np.asarray(carry), np.asarray(outputs), ()
 
     def _scan(self, groups: dict[str, Leaves], steps: int, lanes: int) -> tuple[Leaves, Leaves]:
-        tables, scanned = ({name: groups[name] for name in names if name in groups} for names in (("tables",), _SCANNED))
-        axes = [0 if name in _OF_LANES else None for name in self._examples]
+        tables = {name: arrays for name, arrays in groups.items() if name not in EXTENTS}
+        scanned = {name: arrays for name, arrays in groups.items() if "samples" in EXTENTS.get(name, "")}
+        axes = [0 if "lanes" in EXTENTS[name] else None for name in self._examples]
         move_lanes = jax.vmap(functools.partial(self._sample, **tables), axes, axis_size=lanes)
 
         def advance(carry: Leaves, inputs: dict[str, Leaves]) -> tuple[Leaves, Leaves]:

@@ -56,6 +56,12 @@ class LoopHooks(NamedTuple):
 
 
 NO_HOOKS = LoopHooks()
+EXTENTS = {
+    "values": "lanes", "carry": "lanes", "constants": "scalar", "sample_inputs": "samples",
+    "lane_inputs": "samples and lanes", "block_inputs": "blocks", "final_inputs": "scalar",
+    "outputs": "samples and lanes", "flags": "blocks and lanes", "results": "lanes",
+}  # fmt: skip
+"""Groups of a loop's arrays in their order, and what each of their arrays has a number for."""
 
 
 def find_carry_dependences(

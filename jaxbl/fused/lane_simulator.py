@@ -70,8 +70,7 @@ class LaneSimulator(abc.ABC):
     Args:
         experiment, reducers: as for :func:`jaxbl.chain.scan`.
         paths: paths of the leaves that differ from lane to lane.
-        lanes: number of lanes that the code is compiled for.
-        multiple: the lanes are padded to a multiple of this number.
+        lanes: number of lanes that the code is compiled for; whoever compiles it sets the number that they are padded to.
 
     Attributes:
         carry_count: number of values that each lane carries from sample to sample, without those that all lanes share.
@@ -80,9 +79,10 @@ class LaneSimulator(abc.ABC):
         Unsupported: a step does something that a compiled loop cannot do.
     """
 
-    def __init__(self, experiment: Experiment, reducers: Reducers, paths: tuple[str, ...], lanes: int, multiple: int):
-        self._paths, self._steps = paths, experiment.run.steps
-        self._lanes, self._padded_lanes = lanes, -(-lanes // multiple) * multiple
+    _padded_lanes: int
+
+    def __init__(self, experiment: Experiment, reducers: Reducers, paths: tuple[str, ...], lanes: int):
+        self._paths, self._lanes, self._steps = paths, lanes, experiment.run.steps
         self._block_length = block_length(self._steps)
         dtype = jnp.result_type(experiment.run.sample_period)
         self._dtype = np.dtype(dtype)
@@ -195,26 +195,24 @@ class HostSimulator(LaneSimulator):
     """Simulates lanes by code for this machine's processor; `threads` share the lanes."""
 
     def __init__(self, experiment: Experiment, reducers: Reducers, paths: tuple[str, ...], lanes: int, threads: int):
-        dtype = np.dtype(jnp.result_type(experiment.run.sample_period))
-        self._vector_lanes = vector_lanes(dtype)
-        super().__init__(experiment, reducers, paths, lanes, self._vector_lanes)
-        if any(eqn.primitive.name == "scan" for eqn in self._step.jaxpr.eqns):
-            # plant steps within a sample: each number waits for the one before, so that wider vectors keep the core busy
-            self._vector_lanes *= 2
-            self._padded_lanes = -(-lanes // self._vector_lanes) * self._vector_lanes
+        super().__init__(experiment, reducers, paths, lanes)
+        # plant steps within a sample: each number waits for the one before, so that wider vectors keep the core busy
+        has_substeps = any(eqn.primitive.name == "scan" for eqn in self._step.jaxpr.eqns)
+        together = vector_lanes(self._dtype) * (2 if has_substeps else 1)
         self._loop = Loop(
-            self._step, self._dtype, values=len(paths), carry=self.carry_count, hooks=self._hooks, lanes=self._vector_lanes
+            self._step, self._dtype, values=len(paths), carry=self.carry_count, hooks=self._hooks, lanes=together
         )
+        self._padded_lanes = self._loop.whole_vectors(lanes)
         # each pool has one thread, so that its lanes take span after span, whatever the other threads do
-        work = self._padded_lanes * self._steps * dtype.itemsize
-        count = min(threads, self._padded_lanes // self._vector_lanes, max(work // _THREAD_WORK, 1))
+        work = self._padded_lanes * self._steps * self._dtype.itemsize
+        count = min(threads, self._padded_lanes // together, max(work // _THREAD_WORK, 1))
         self._pools = [ThreadPoolExecutor(1) for _ in range(count)]
 
     def _simulate(self, values, spans):
         rows = np.asarray(values, self._dtype).reshape(len(values), self._padded_lanes)
         results = allocate(self._loop.signature["results"], (self._padded_lanes,))
         # vectors of lanes are dealt in turns: lanes that are done together are often neighbours, and then leave all threads
-        vectors, count = np.arange(self._padded_lanes).reshape(-1, self._vector_lanes), len(self._pools)
+        vectors, count = np.arange(self._padded_lanes).reshape(-1, self._loop.lanes), len(self._pools)
         threads = [
             _ThreadLanes(self._loop, vectors[i::count].ravel(), rows, results, self._block_length) for i in range(count)
         ]
@@ -361,7 +359,8 @@ class DeviceSimulator(LaneSimulator):
 
         # the shared part runs as a loop of scalars on a processor; a GPU would start a kernel for each of its steps
         with jax.default_device(host_device()):
-            super().__init__(experiment, reducers, paths, lanes, LANES)
+            super().__init__(experiment, reducers, paths, lanes)
+        self._padded_lanes = -(-lanes // LANES) * LANES
         kernel = Kernel(
             self._step, self._hooks, len(paths), self._padded_lanes, self._steps, self._block_length, interpret=interpret
         )

@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import binding, ir
 
 from . import ArrayGroup, Unsupported
-from .dependence import NO_HOOKS, LoopHooks
+from .dependence import EXTENTS, NO_HOOKS, LoopHooks
 from .jaxprs import ClosedJaxpr, JaxprEqn
 from .scalar_writer import COMPARISONS, ScalarWriter
 
@@ -60,12 +60,6 @@ def vector_lanes(dtype: np.dtype) -> int:
 
 Signature = dict[str, list[np.dtype]]
 """Types of the numbers in a loop's arrays, by group."""
-_EXTENTS = {
-    "values": "lanes", "carry": "lanes", "constants": "scalar", "sample_inputs": "samples",
-    "lane_inputs": "samples and lanes", "block_inputs": "blocks", "final_inputs": "scalar",
-    "outputs": "samples and lanes", "flags": "blocks and lanes", "results": "lanes",
-}  # fmt: skip
-"""Groups of arrays in the order of a loop's table, and what each of their arrays has a number for."""
 
 
 class Loop:
@@ -101,7 +95,7 @@ class Loop:
         read = iter(body.jaxpr.invars)
         counts = {"sample_inputs": len(body.jaxpr.invars) - sum(counts.values())} | counts
         # the groups that a sample reads are the first ones
-        groups = {group: [*islice(read, counts.get(group, 0))] for group in _EXTENTS}
+        groups = {group: [*islice(read, counts.get(group, 0))] for group in EXTENTS}
         carry, lane_count = len(groups["carry"]), len(groups["values"]) + len(groups["carry"])
         groups["outputs"] = body.jaxpr.outvars[carry:]
         if hooks.after_block:
@@ -177,7 +171,7 @@ class Loop:
             "flags": allocate(self.signature["flags"], (blocks, width)),
         }
         for name, arrays in inputs.items():
-            if any(padding) and len(arrays) and "lanes" in _EXTENTS[name]:
+            if any(padding) and len(arrays) and "lanes" in EXTENTS[name]:
                 stack = np.asarray(arrays)
                 arrays = np.pad(stack, [*[(0, 0)] * (stack.ndim - 1), padding], "edge")
             groups[name] = [*map(np.array, arrays)] if name == "carry" else arrays
@@ -218,7 +212,7 @@ class LoopArrays:
         }  # fmt: skip
         addresses: list[int] = []
         for name, dtypes in signature.items():
-            arrays, count = groups.get(name, ()), counts[_EXTENTS[name]]
+            arrays, count = groups.get(name, ()), counts[EXTENTS[name]]
             if len(arrays) != len(dtypes):
                 raise ValueError(f"a loop needs {len(dtypes)} {name}, not {len(arrays)}")
             # rows of one array are checked at once: NumPy takes long to find an address

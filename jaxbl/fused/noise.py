@@ -37,52 +37,46 @@ def host_device() -> Any:
 
 def draw_noise(seed: int, first: int, count: int, sides: tuple[str, ...] = SIDES) -> NamedArrays:
     """Draw the noise of each side `(count,)` for at most `LONGEST_SPAN` samples from `first` on."""
-    size = max(LONGEST_SPAN // 4, 1 << (count - 1).bit_length())
     drawn = SIDES if {*SIDES}.issuperset(sides) else sides
-    return dict(zip(drawn, np.asarray(_compile_noise(size, drawn)(seed, first, count))[:, :count], strict=True))
+    return dict(zip(drawn, np.asarray(_compile_noise(drawn)(seed, first, count))[:, :count], strict=True))
 
 
 @cache
-def _compile_noise(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
-    """A function that draws the noise of at most `size` samples; compiled once for all studies."""
+def _compile_noise(sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
+    """A function that draws the noise of at most `LONGEST_SPAN` samples; compiled once for all studies."""
     with jax.default_device(host_device()):
         try:
-            return _compile_noise_by_loop(size, sides)
+            return _compile_noise_by_loop(sides)
         except Unsupported:
-            return _compile_noise_by_xla(size, sides)
+            return _compile_noise_by_xla(sides)
 
 
-def _compile_noise_by_xla(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
+def _compile_noise_by_xla(sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
     def draw(seed: Any, first: Any) -> Any:
-        by_side = unit_noise(seed, first + jnp.arange(size, dtype=jnp.int32), sides)
+        by_side = unit_noise(seed, first + jnp.arange(LONGEST_SPAN, dtype=jnp.int32), sides)
         return jnp.stack([by_side[side] for side in sides])
 
     program = jax.jit(draw).lower(np.uint32(0), np.int32(0)).compile()
     return lambda seed, first, count: program(np.uint32(seed), np.int32(first))
 
 
-def _compile_noise_by_loop(size: int, sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
+def _compile_noise_by_loop(sides: tuple[str, ...]) -> Callable[[int, int, int], Any]:
     """The same by a loop for the random bits. Raises `Unsupported` for other sides, or where JAX draws them otherwise."""
     settings: Any = jax.config
     if sides != SIDES or settings.jax_default_prng_impl != "threefry2x32" or not settings.jax_threefry_partitionable:
         raise Unsupported("random bits of other sides, or by another generator")
     with raising_unsupported():
-        loop = _compile_bits_loop()
-        bits = jax.ShapeDtypeStruct((2, size), jnp.uint32)
+        loop = Loop(jax.make_jaxpr(_random_bits)(_WORD, _WORD), np.dtype(np.float32), constants=1, lane_inputs=1)
+        bits = jax.ShapeDtypeStruct((2, LONGEST_SPAN), jnp.uint32)
         program = jax.jit(jax.vmap(jax.vmap(_normal_number))).lower(bits).compile()
 
     def draw(seed: int, first: int, count: int) -> Any:
-        samples, bits = np.arange(first, first + count, dtype=np.uint32), np.zeros((2, size), np.uint32)
+        samples, bits = np.arange(first, first + count, dtype=np.uint32), np.zeros((2, LONGEST_SPAN), np.uint32)
         drawn = loop.run(1, count, constants=[np.array(seed, np.uint32)], lane_inputs=[samples])[1]
         bits[:, :count] = np.concatenate(drawn)
         return program(bits)
 
     return draw
-
-
-@cache
-def _compile_bits_loop() -> Loop:
-    return Loop(jax.make_jaxpr(_random_bits)(_WORD, _WORD), np.dtype(np.float32), constants=1, lane_inputs=1)
 
 
 def _random_bits(seed: Any, index: Any) -> tuple[Any, Any]:

@@ -86,7 +86,6 @@ def make_parts(half, precision):
         (metrics_reducer(metric_names),),
         tuple(path for path in leaf_paths(full_experiment) if path.startswith("effects.")),
         5,
-        LANES,
     )
 
 
@@ -150,7 +149,7 @@ def test_what_no_axis_touches_is_computed_once():
     full_experiment = make_experiment([], DeadZone(60.0, 0.05))
     values = spread_lane_values(full_experiment, ["observer.motor.alpha", "observer.motor.lambda"], 7)
     simulator = HostSimulator(full_experiment, (ALL_METRICS,), tuple(values), 7, 1)
-    varied_parts = Parts(full_experiment, (ALL_METRICS,), ("transmission.half_gap",), 7, 1)
+    varied_parts = Parts(full_experiment, (ALL_METRICS,), ("transmission.half_gap",), 7)
     assert simulator.carry_count < varied_parts.carry_count
     # the plant's states are stepped by a loop of scalars, ahead of the lanes
     assert isinstance(simulator._run_shared_part, SharedPartLoop)
@@ -252,7 +251,7 @@ def test_an_error_of_a_thread_reaches_the_caller(monkeypatch):
             raise MemoryError("no more")
         loop(*arguments, **options)
 
-    fail_third_call.signature = loop.signature
+    fail_third_call.signature, fail_third_call.lanes = loop.signature, loop.lanes
     monkeypatch.setattr(simulator, "_loop", fail_third_call)
     with pytest.raises(MemoryError, match="no more"):
         simulator(work.values(), SEED)
@@ -283,7 +282,8 @@ def test_lanes_that_are_done_leave_and_nothing_else_changes(monkeypatch, precisi
             samples.append((end - options.get("start", 0)) * arrays.lanes)
             loop(arrays, end, **options)
 
-        count_samples.signature, count_samples.whole_vectors = loop.signature, loop.whole_vectors
+        count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
+        count_samples.whole_vectors = loop.whole_vectors
         monkeypatch.setattr(simulator, "_loop", count_samples)
         for order in orders:
             samples.clear()
@@ -330,7 +330,8 @@ def test_lanes_whose_answer_is_known_leave(monkeypatch, precision, threads):
                 samples.append(arrays.lanes)
             loop(arrays, end, **options)
 
-        count_samples.signature, count_samples.whole_vectors = loop.signature, loop.whole_vectors
+        count_samples.signature, count_samples.lanes = loop.signature, loop.lanes
+        count_samples.whole_vectors = loop.whole_vectors
         monkeypatch.setattr(simulator, "_loop", count_samples)
         samples.clear()
         actual = simulator(values, 3)
