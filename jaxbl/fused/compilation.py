@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -61,7 +61,9 @@ def jit(function: Callable[..., Result]) -> Callable[..., Result]:
         arrays = [_plain(leaf) for leaf in leaves if eqx.is_array(leaf)]
         shapes = map(_shape, arrays)
         examples = tuple(next(shapes) if eqx.is_array(leaf) else leaf for leaf in leaves)
-        return _program(function, structure, examples)(arrays)
+        compiled, result = _program(function, structure, examples)
+        outputs = iter(compiled(*arrays))
+        return jax.tree.map(lambda leaf: next(outputs) if _is_shape(leaf) else leaf, result)
 
     return call
 
@@ -77,22 +79,15 @@ def _plain(leaf: Any) -> Any:
 def _shape(array: Any) -> jax.ShapeDtypeStruct:
     """What stands in the place of an array. Of NumPy's none is weak."""
     is_weak = isinstance(array, jax.Array) and array.aval.weak_type
-    return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=is_weak)
+    return _make_shape(array.shape, array.dtype, weak_type=is_weak)
+
+
+_make_shape = functools.lru_cache(jax.ShapeDtypeStruct)
+"""Each is made once, which takes longer than to find it."""
 
 
 def _is_shape(leaf: Any) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
-
-
-class _Program(NamedTuple):
-    """A compiled program of arrays, and what its result is made of: a pytree with shapes in their places."""
-
-    compiled: Callable[..., list[jax.Array]]
-    result: Any
-
-    def __call__(self, arrays: list[jax.Array]) -> Any:
-        outputs = iter(self.compiled(*arrays))
-        return jax.tree.map(lambda leaf: next(outputs) if _is_shape(leaf) else leaf, self.result)
 
 
 @functools.cache
@@ -107,8 +102,13 @@ def _initialise() -> None:
 
 
 @functools.lru_cache(maxsize=_MOST)
-def _program(function: Callable[..., Any], structure: Any, examples: tuple) -> _Program:
-    """A program from disk, or compiled and put there, for arguments of a structure with shapes in the places of arrays."""
+def _program(function: Callable[..., Any], structure: Any, examples: tuple) -> tuple[Callable[..., list[jax.Array]], Any]:
+    """A program of arrays, from disk, or compiled and put there; and what its result is made of.
+
+    Args:
+        function: that is compiled.
+        structure, examples: of its arguments, as of the result, with shapes in the places of arrays.
+    """
     args, kwargs = structure.unflatten(examples)
     shapes = [leaf for leaf in examples if _is_shape(leaf)]
     key = program_cache.program_key("program", function, args, kwargs)
@@ -121,7 +121,7 @@ def _program(function: Callable[..., Any], structure: Any, examples: tuple) -> _
             loaded = deserialize_and_load(
                 code, inputs, jax.tree.structure([0] * count), execution_devices=jax.local_devices()[:devices]
             )
-            return _Program(loaded, result)
+            return loaded, result
         except Exception:  # whatever another version of JAX, or another machine, makes of it
             pass
     results = []
@@ -147,4 +147,4 @@ def _program(function: Callable[..., Any], structure: Any, examples: tuple) -> _
     if key is not None and shardings:
         with suppress(Exception):  # JAX cannot write it: it is compiled anew next time
             program_cache.save(key, (serialize(compiled)[0], len(shardings), len(shardings[0].device_set), results[-1]))
-    return _Program(compiled, results[-1])
+    return compiled, results[-1]
