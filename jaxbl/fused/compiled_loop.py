@@ -35,7 +35,7 @@ def compile_once(define: Callable[..., LoopDefinition]) -> Any:
             with raising_unsupported(), jax.enable_x64(True):
                 from .llvm import Loop
 
-                counts = {group: len(jax.tree.leaves(numbers)) for group, numbers in examples.items()}
+                counts: Any = {group: len(jax.tree.leaves(numbers)) for group, numbers in examples.items()}
                 loop = Loop(jax.make_jaxpr(sample)(*examples.values()), np.dtype(float), lanes=lanes, **counts)
                 program_cache.save(key, loop)
                 return loop
@@ -64,9 +64,12 @@ class ScannedLoop:
 
     def run(self, steps: int, lanes: int = 1, **inputs: ArrayGroup) -> tuple[ArrayGroup, ArrayGroup, ArrayGroup]:
         """Take lanes through all samples, as a compiled loop does."""
+        given = inputs.pop("outputs", ())
         with jax.enable_x64(True):
             groups = {name: [*map(jnp.asarray, arrays)] for name, arrays in inputs.items()}
             carry, outputs = self._program(groups, steps=steps, lanes=lanes)
+        for array, output in zip(given, outputs, strict=False):
+            array[...] = output
         return np.asarray(carry), np.asarray(outputs), ()
 
     def _scan(self, groups: dict[str, Leaves], steps: int, lanes: int) -> tuple[Leaves, Leaves]:

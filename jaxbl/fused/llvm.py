@@ -159,17 +159,16 @@ class Loop:
             steps: number of samples.
             lanes: number of lanes.
             block_length: samples of a block; left out, all samples are one block.
-            inputs: arrays of the groups that are read.
+            inputs: arrays of the groups that are read; and `outputs`, if there are arrays for them, as for whole vectors.
 
         Returns:
             The carry `(lanes,)`, outputs `(samples, lanes)`, and flags `(blocks, lanes)`.
         """
         width = self.whole_vectors(lanes)
         blocks, padding = -(-steps // (block_length or max(steps, 1))), (0, width - lanes)
-        groups: dict[str, ArrayGroup] = {
-            "outputs": allocate(self.signature["outputs"], (steps, width)),
-            "flags": allocate(self.signature["flags"], (blocks, width)),
-        }
+        groups: dict[str, ArrayGroup] = {"flags": allocate(self.signature["flags"], (blocks, width))}
+        if "outputs" not in inputs:
+            groups["outputs"] = allocate(self.signature["outputs"], (steps, width))
         for name, arrays in inputs.items():
             if any(padding) and len(arrays) and "lanes" in EXTENTS[name]:
                 stack = np.asarray(arrays)
@@ -217,7 +216,8 @@ class LoopArrays:
                 raise ValueError(f"a loop needs {len(dtypes)} {name}, not {len(arrays)}")
             # rows of one array are checked at once: NumPy takes long to find an address
             is_stack = isinstance(arrays, np.ndarray) and len(set(dtypes)) == 1
-            for array, dtype in [(arrays, dtypes[0])] if is_stack else zip(arrays, dtypes, strict=True):
+            members: Any = [(arrays, dtypes[0])] if is_stack else zip(arrays, dtypes, strict=True)
+            for array, dtype in members:
                 rows = len(dtypes) if is_stack else 1
                 if array.dtype != dtype or array.size != rows * count or not array.flags.c_contiguous:
                     wrong = f"not {array.size} of {array.dtype}"

@@ -156,16 +156,17 @@ def step_derivatives(
     width = loop.whole_vectors(len(torque))
     values = np.pad(np.stack([*leaves, torque, time], dtype=float), ((0, 0), (0, width - len(torque))), "edge")
     (numbers, tables), tangents = structure.split_leaves(experiment), structure.stack_tangents(directions)
+    changes, new = np.empty((len(tangents), len(leaves), width)), np.empty((len(leaves), width))
 
-    def differentiate(first: int) -> np.ndarray:
-        constants = np.concatenate([numbers, *tangents[first : first + _TOGETHER]])
-        # changes along each direction, then the new state, which is the same for all
-        _, found, _ = loop.run(1, width, values=values, constants=constants, tables=tables)
-        return found.reshape(_TOGETHER + 1, len(leaves), width)
+    def differentiate(first: int) -> None:
+        together = slice(first, first + _TOGETHER)
+        constants = np.concatenate([numbers, *tangents[together]])
+        # all write the same new state
+        outputs = [*changes[together].reshape(-1, width), *new]
+        loop.run(1, width, values=values, constants=constants, tables=tables, outputs=outputs)
 
-    found = map_in_threads(differentiate, range(0, len(tangents), _TOGETHER))
-    changes = np.concatenate([rows[:-1] for rows in found])
-    return changes[: len(directions), :, : len(torque)], found[0][-1, :, : len(torque)]
+    map_in_threads(differentiate, range(0, len(tangents), _TOGETHER))
+    return changes[: len(directions), :, : len(torque)], new[:, : len(torque)]
 
 
 class _PlantStructure(NamedTuple):
@@ -241,7 +242,7 @@ def _find_places(structure: _PlantStructure, paths: tuple[str, ...]) -> tuple[in
 def _trajectory_loop(structure: _PlantStructure, sides: tuple[str, ...] = ()) -> LoopDefinition:
     """The loop from state, numbers, first time and gains, and a sample's index, torque and readings."""
 
-    def sample(state: Leaves, constants: Any, inputs: Leaves, tables: Leaves = ()) -> tuple[Leaves, Leaves]:
+    def sample(state: Leaves, constants: Any, inputs: Leaves, tables: Sequence[Any] = ()) -> tuple[Leaves, Leaves]:
         (numbers, start, gains), (index, torque, *readings) = constants, inputs
         experiment = structure.build_experiment(numbers, tables)
         gain = {side: gains[2 * i : 2 * i + 2] for i, side in enumerate(sides)}
@@ -265,7 +266,7 @@ _TOGETHER = 2
 def _derivatives_loop(structure: _PlantStructure) -> LoopDefinition:
     """The loop from a lane's state, torque and time, from numbers, and from tangents of numbers, state and torque."""
 
-    def differentiate(values: Any, constants: Any, tables: Leaves = ()) -> tuple[Leaves, Leaves]:
+    def differentiate(values: Any, constants: Any, tables: Sequence[Any] = ()) -> tuple[Leaves, Leaves]:
         (start, torque, time), (numbers, tangents) = values, constants
 
         def begin(numbers: Leaves, start: Leaves, torque: Any) -> tuple[PlantState, Any]:
