@@ -217,9 +217,8 @@ class Stream:
         columns, values = block
         values, remaining = values[:_BATCH_ROWS], values[_BATCH_ROWS:]
         self._block = (columns, remaining) if len(remaining) else None
-        # each header has a list of its own: another file begins anew, with the same names, too
-        is_new = columns is not self._columns and not (isinstance(columns, range) and columns == self._columns)
-        if is_new and not self._read_columns(columns):
+        # another file begins anew, with the same names, too
+        if columns is not self._columns and not self._read_columns(columns):
             self._count(OTHER_COLUMNS, len(values))
             return []
         assert self._reader is not None
@@ -362,6 +361,7 @@ class Source:
     Args:
         name: for messages.
         fields: columns that are needed.
+        columns: of rows before there is a header; none where the first rows have to tell them.
 
     Attributes:
         name: for messages.
@@ -369,61 +369,93 @@ class Source:
         fault: end of a sentence on the last line or datagram that could not be read; "" if there is none.
     """
 
-    def __init__(self, name: str, fields: Sequence[ColumnName]):
+    _format_lines = 1
+    """Lines that the format is detected from, at least."""
+
+    def __init__(self, name: str, fields: Sequence[ColumnName], columns: Sequence[ColumnName] = ()):
         self.name, self.counts, self.fault = name, Counter[str](), ""
-        self._fields = list(fields)
+        self._needed = [field for field in fields if isinstance(field, str)]
+        self._columns, self._header = columns, ""
         self._format: TextFormat | None = None
-        self._header = ""
+        self._blocks = deque[tuple[Sequence[ColumnName], list[list[float]]]]()
 
     def poll(self, seconds: float) -> Block | None:
         """Wait at most `seconds` for rows.
 
         Returns:
-            Names of the columns, and numbers (rows, columns), NaN for a cell without one; None if nothing has come.
+            Names of the columns, a list of its own for each header, and numbers (rows, columns), NaN for a cell without one;
+            None if nothing has come.
 
         Raises:
             InputError: no row can be used.
         """
+        if not self._blocks:
+            self._receive(seconds)
+        if not self._blocks:
+            return None
+        columns, rows = self._blocks.popleft()
+        return columns, np.array(rows)
+
+    def _receive(self, seconds: float) -> None:
+        """Wait at most `seconds` for rows, and add them."""
         raise NotImplementedError
 
     def close(self) -> None:
         """Release the file or the address."""
 
-    def _parse_lines(self, text_format: TextFormat, lines: deque[str]) -> np.ndarray:
-        """Take lines, as far as they have one format, and parse them into numbers, shape (rows, columns).
+    def _parse_lines(self, lines: deque[str]) -> None:
+        """Take lines, none of them blank, and add their rows; too few lines to show the format are left.
 
         Repeated headers are left out, malformed lines are counted. A header of other columns begins another format.
         """
-        rows = list[list[float]]()
-        while lines:
-            line = lines[0]
-            if line != self._header and has_cells(line):
-                row = text_format.parse_row(line)
-                if (row is None or all(map(math.isnan, row))) and self._is_other_header(line):
-                    if rows:
-                        break
-                    self._format = text_format = detect_text_format([line])._replace(decimal=text_format.decimal)
-                    self._header = line
-                elif row is None:
-                    self.counts[MALFORMED] += 1
-                    self.fault = f"; a line should have {text_format.count} cells"
-                else:
-                    rows.append(row)
-            lines.popleft()
-        return np.array(rows).reshape(-1, text_format.count)
+        while lines and (self._format is not None or len(lines) >= self._format_lines):
+            try:
+                text_format = self._format or self._set_format(detect_text_format([*lines]), lines[0])
+            except InputError as error:
+                if not self._columns:
+                    raise InputError(f"{self.name}: {error}") from None
+                self._count(MALFORMED, f"the last: {error}")
+                lines.popleft()
+                continue
+            if (line := lines.popleft()) == self._header:
+                continue
+            row = text_format.parse_row(line)
+            if (row is None or all(map(math.isnan, row))) and (header := self._find_header(line)) is not None:
+                self._set_format(header._replace(decimal=text_format.decimal), line)
+            elif row is None:
+                self._count(MALFORMED, f"a line should have {text_format.count} cells")
+            else:
+                self._add_rows([row])
 
-    def _is_other_header(self, line: str) -> bool:
-        """Return True if a line names all columns that are needed."""
-        names = None
+    def _find_header(self, line: str) -> TextFormat | None:
+        """Return the format that a line begins which names all columns that are needed."""
         with suppress(InputError):
-            names = detect_text_format([line]).names
-        needed = {field for field in self._fields if isinstance(field, str)}
-        return names is not None and bool(needed) and needed <= {*names}
+            text_format = detect_text_format([line])
+            if text_format.names is not None and self._needed and {*self._needed} <= {*text_format.names}:
+                return text_format
+        return None
 
-    def _count_malformed(self, fault: str) -> bool:
-        self.counts[MALFORMED] += 1
-        self.fault = f"; the last: {shorten(fault, 200)}"
-        return False
+    def _set_format(self, text_format: TextFormat, line: str) -> TextFormat:
+        """Read as of `line` in another format. A file that was cut off may go on without a header.
+
+        Raises:
+            InputError: the format does not have the columns that are needed.
+        """
+        if text_format.names is not None:
+            self._columns, self._header = text_format.names, line
+        elif text_format.count != len(self._columns):
+            self._columns, self._header = range(text_format.count), ""
+        self._format = text_format
+        return text_format
+
+    def _add_rows(self, rows: list[list[float]]) -> None:
+        if not (self._blocks and self._blocks[-1][0] is self._columns):
+            self._blocks.append((self._columns, []))
+        self._blocks[-1][1].extend(rows)
+
+    def _count(self, fault: str, text: str) -> None:
+        self.counts[fault] += 1
+        self.fault = f"; {shorten(text, 200)}"
 
 
 class FollowedFile(Source):
@@ -437,65 +469,35 @@ class FollowedFile(Source):
         InputError: it cannot be read, or is no text.
     """
 
+    _format_lines = 2
+    """A header and a row: the decimal sign shows only in a row."""
+
     def __init__(self, path: Path, fields: Sequence[ColumnName] = ()):
         super().__init__(str(path), fields)
         self._path = path
         self._incomplete_line, self._lines = b"", deque[str]()
         self._is_too_long = False
-        self._previous_format: TextFormat | None = None
         self._unfit_file = 0
         with name_file_in_errors(path, "name a text file"):
             self._file = open_regular_file(path)
 
-    def poll(self, seconds: float) -> Block | None:
+    def _receive(self, seconds: float) -> None:
         end = time.monotonic() + seconds
-        if self._format is None or not self._lines:
-            while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
-                time.sleep(min(_FILE_POLL_SECONDS, remaining))
-            if not block:
-                return None
-            if b"\0" in block and self._format is None and self._previous_format is None:
-                raise InputError(f"{self.name}: is no text: only text files are followed; leave --follow out")
-            self._split_lines(block)
-        try:
-            if self._format is None and not self._detect_format():
-                return None
-        except InputError as error:
-            if self._previous_format is None:
-                raise InputError(f"{self.name}: {error}") from None
-            self._count_malformed(str(error))
-            self._lines.popleft()
-            return None
-        assert self._format is not None
-        rows = self._parse_lines(self._format, self._lines)
-        return self._format.names or range(self._format.count), rows
-
-    def _split_lines(self, block: bytes) -> None:
-        """Split what was read into lines, at lone carriage returns, too; the last one may be incomplete."""
+        while not (block := self._read()) and (remaining := end - time.monotonic()) > 0.0:
+            time.sleep(min(_FILE_POLL_SECONDS, remaining))
+        if b"\0" in block and not self._columns:
+            raise InputError(f"{self.name}: is no text: only text files are followed; leave --follow out")
+        # lone carriage returns end lines, too; the last line may be incomplete
         *lines, self._incomplete_line = re.split(rb"\r\n|\r|\n", self._incomplete_line + block)
         if len(self._incomplete_line) > MAX_LINE_BYTES:
             self._incomplete_line, self._is_too_long = b"", True
         if lines and self._is_too_long:
             self._is_too_long = False
-            self._count_malformed(f"a line of more than {MAX_LINE_BYTES / 1e6:.0f} MB; there should be one a row")
+            self._count(MALFORMED, f"the last: a line of more than {MAX_LINE_BYTES / 1e6:.0f} MB; there should be one a row")
             lines = lines[1:]
         texts = (line.decode("utf-8-sig", errors="replace") for line in lines)
         self._lines += filter(has_cells, texts)
-
-    def _detect_format(self) -> bool:
-        """Detect the format from a header and a row, as the decimal sign shows only in a row; False before they are there.
-
-        A file that was cut off may go on without a header.
-        """
-        if len(self._lines) < 2:
-            return False
-        text_format, previous = detect_text_format([*self._lines]), self._previous_format
-        if text_format.names is None and previous is not None and previous.count == text_format.count:
-            text_format = text_format._replace(names=previous.names)
-        else:
-            self._header = self._lines[0] if text_format.names is not None else ""
-        self._format = text_format
-        return True
+        self._parse_lines(self._lines)
 
     def _read(self) -> bytes:
         block = self._file.read(_READ_BYTES)
@@ -514,12 +516,10 @@ class FollowedFile(Source):
                     return b""
                 except (OSError, InputError) as error:
                     self._unfit_file = current.st_ino
-                    self.counts[OTHER_FILES] += 1
-                    self.fault = f"; {self.name}: {error}"
+                    self._count(OTHER_FILES, f"{self.name}: {error}")
                     return b""
                 self._file.close()
-                self._file, self._incomplete_line = file, b""
-                self._previous_format, self._format = self._format or self._previous_format, None
+                self._file, self._incomplete_line, self._format = file, b"", None
                 block = self._file.read(_READ_BYTES)
         return block
 
@@ -539,8 +539,9 @@ class Datagrams(Source):
     """
 
     def __init__(self, address: str, fields: Sequence[ColumnName]):
-        super().__init__(address, fields)
-        self._has_numbered_fields = any(isinstance(field, int) for field in fields)
+        # numbered columns may be any of more
+        numbers = [field for field in fields if isinstance(field, int)]
+        super().__init__(address, fields, range(max(*numbers, len(fields) - 1) + 1) if numbers else fields)
         host, port = _parse_address(address)
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -559,11 +560,10 @@ class Datagrams(Source):
         # Linux may buffer only some hundred datagrams, fewer than come at 10 kHz while values are computed
         self._received, self._closing = deque[bytes](), threading.Event()
         self._received_bytes = self._taken_bytes = 0
-        self._blocks = deque[Block]()
-        self._receiver = threading.Thread(target=self._receive, name="jaxbl-datagrams", daemon=True)
+        self._receiver = threading.Thread(target=self._buffer, name="jaxbl-datagrams", daemon=True)
         self._receiver.start()
 
-    def _receive(self) -> None:
+    def _buffer(self) -> None:
         self._socket.settimeout(_SOCKET_TIMEOUT)
         while not self._closing.is_set():
             # nothing has come, or an error that concerns a single datagram
@@ -575,69 +575,30 @@ class Datagrams(Source):
                 self._received_bytes += len(datagram)
                 self._received.append(datagram)
 
-    def poll(self, seconds: float) -> Block | None:
-        if self._blocks:
-            return self._blocks.popleft()
+    def _receive(self, seconds: float) -> None:
         if len(self._received) < _BATCH_ROWS:
             time.sleep(seconds)
         for datagram in [self._received.popleft() for _ in range(min(len(self._received), _BATCH_ROWS))]:
             self._taken_bytes += len(datagram)
-            if datagram.translate(None, _TEXT_BYTES):
-                self._add_rows(self._parse_bytes(datagram))
+            row_bytes = 8 * len(self._columns)
+            if not datagram.translate(None, _TEXT_BYTES):
+                self._parse_lines(deque(filter(has_cells, datagram.decode().splitlines())))
+            elif len(datagram) % row_bytes:
+                text = f"{len(datagram)} bytes; rows of {len(self._columns)} float64 have a multiple of {row_bytes}"
+                self._count(MALFORMED, f"the last: {text}")
             else:
-                lines = deque(datagram.decode().splitlines())
-                while lines:
-                    self._add_rows(self._parse_text(lines))
-        return self._blocks.popleft() if self._blocks else None
+                self._add_rows(np.frombuffer(datagram, "<f8").reshape(-1, len(self._columns)).tolist())
 
-    def _add_rows(self, rows: np.ndarray) -> None:
-        columns = self._column_names()
-        if len(rows):
-            if self._blocks and list(self._blocks[-1][0]) == list(columns):
-                rows = np.concatenate([self._blocks.pop()[1], rows])
-            self._blocks.append((columns, rows))
-
-    def _column_names(self) -> Sequence[ColumnName]:
-        if self._format is not None and self._format.names is not None:
-            return self._format.names
-        return range(self._count_columns()) if self._has_numbered_fields else self._fields
-
-    def _count_columns(self) -> int:
-        """Return the number of columns; before the format is known, the least number of a row without a header."""
-        if self._format is not None:
-            return self._format.count
-        return max([*(field + 1 for field in self._fields if isinstance(field, int)), len(self._fields)])
-
-    def _parse_bytes(self, datagram: bytes) -> np.ndarray:
-        width = self._count_columns()
-        if len(datagram) % (8 * width):
-            self._count_malformed(f"{len(datagram)} bytes; rows of {width} float64 have a multiple of {8 * width}")
-            return np.empty((0, width))
-        return np.frombuffer(datagram, "<f8").reshape(-1, width)
-
-    def _parse_text(self, lines: deque[str]) -> np.ndarray:
-        """Take lines of one format, shape (rows, columns). Lines before the first one in a fit format are malformed."""
-        while lines and self._format is None and not (has_cells(lines[0]) and self._detect_format([*lines])):
-            lines.popleft()
-        return np.empty((0, 0)) if self._format is None else self._parse_lines(self._format, lines)
-
-    def _detect_format(self, lines: list[str]) -> bool:
-        """Detect the format from the first of some lines; False if that line is malformed."""
-        try:
-            text_format = detect_text_format(lines)
-        except InputError as error:
-            return self._count_malformed(str(error))
-        width = self._count_columns()
+    def _set_format(self, text_format: TextFormat, line: str) -> TextFormat:
+        width, is_numbered = len(self._columns), isinstance(self._columns, range)
         if text_format.names is not None:
-            missing = [field for field in self._fields if isinstance(field, str) and field not in text_format.names]
+            missing = [field for field in self._needed if field not in text_format.names]
             if missing:
-                return self._count_malformed(f"no column {missing[0]!r} in {lines[0]!r}")
-            self._header = lines[0]
-        elif text_format.count < width or (text_format.count > width and not self._has_numbered_fields):
-            fields = "" if self._has_numbered_fields else f": {', '.join(map(str, self._fields))}"
-            return self._count_malformed(f"{text_format.count} cells in {lines[0]!r}; there should be {width}{fields}")
-        self._format = text_format
-        return True
+                raise InputError(f"no column {missing[0]!r} in {line!r}")
+        elif text_format.count < width or (text_format.count > width and not is_numbered):
+            names = "" if is_numbered else f": {', '.join(map(str, self._columns))}"
+            raise InputError(f"{text_format.count} cells in {line!r}; there should be {width}{names}")
+        return super()._set_format(text_format, line)
 
     def close(self) -> None:
         self._closing.set()
