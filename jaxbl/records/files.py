@@ -43,13 +43,6 @@ from .libraries import (
 )
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
-_LIBRARY_READERS: tuple[tuple[bytes, str, Callable[..., Columns]], ...] = (
-    (b"TDSm", "TDMS", read_tdms),
-    (b"MDF", "MDF", read_mdf),
-    (b"\x89MCAP", "MCAP", read_mcap),
-    (b"#ROSBAG", "a ROS bag", read_bag),
-)
-"""First bytes, name and reader of the kinds that need a library."""
 _SUFFIXES = (
     ".csv", ".txt", ".tsv", ".dat", ".parquet", ".mat", ".h5", ".hdf5", ".json", ".jsonl", ".mf4", ".mdf", ".tdms", ".mcap",
     ".bag",
@@ -198,8 +191,8 @@ class LogFile:
             cell, place = np.asarray(cells, dtype=object)[row], f"column {name!r}, data row {rows[row] + 1} is"
             if np.isfinite(values[row]):
                 raise self.error(f"{place} {values[row]:g}; a reading should be below {LARGEST:g}")
-            is_empty = cell is None or (isinstance(cell, float) and np.isnan(cell))
-            fault = "empty or not a number" if is_empty else repr(cell)
+            # of a cell that holds a list pandas says it element by element
+            fault = "empty or not a number" if pd.isna(cell) is True else repr(cell)
             raise self.error(f"{place} {fault}; it should be a finite number, as 1234.5")
         return values
 
@@ -268,20 +261,12 @@ def _read_columns(path: Path, selection: Selection) -> Columns:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
         is_complete = not file.read(1)
-    for first_bytes, kind, read in _LIBRARY_READERS:
-        if head.startswith(first_bytes):
-            with _report_errors(kind):
-                return read(path, selection)
     if not head.removeprefix(BOM_UTF8).strip():
         raise InputError(f"is empty; {_READABLE_KINDS}")
-    if head.startswith(b"PAR1"):
-        with _report_errors("Parquet"):
-            return _read_parquet(path)
-    # an HDF5 file begins so; MATLAB 7.3 puts half a kilobyte of text before that
-    if b"\x89HDF" in (head[:4], head[512:516]):
-        return _read_hdf5(path)
-    if suffix == ".mat":
-        return _read_matlab(path, selection)
+    for start, ending, kind, read in _BINARY_READERS:
+        if re.match(start, head, re.DOTALL) and suffix.endswith(ending):
+            with _report_errors(kind):
+                return read(path, selection)
     for first_bytes, remedy in _REMEDIES.items():
         if head.startswith(first_bytes):
             raise InputError(remedy)
@@ -355,7 +340,7 @@ def _check_lines(path: Path) -> None:
             line_count += line_ends
 
 
-def _read_parquet(path: Path) -> Columns:
+def _read_parquet(path: Path, _: Selection) -> Columns:
     from pyarrow.parquet import ParquetFile
 
     # opened here, as the library takes names in UTF-8 alone
@@ -715,15 +700,12 @@ def _read_matlab(path: Path, selection: Selection) -> Columns:
     from scipy.io import loadmat
 
     def load_variable(name: str) -> Any:
-        with _report_errors("a MATLAB file"):
-            return loadmat(path, variable_names=[name], squeeze_me=True, struct_as_record=True)[name]
+        return loadmat(path, variable_names=[name], squeeze_me=True, struct_as_record=True)[name]
 
-    with _report_errors("a MATLAB file"):
-        variables = _list_matlab_variables(path)
     selected_variables = {re.split(r"[.\[]", str(column))[0] for column in selection}
     columns = Columns()
     postponed = []
-    for name, shape, kind in variables:
+    for name, shape, kind in _list_matlab_variables(path):
         if kind in ("cell", "struct"):
             # the columns in them are not known before they are loaded
             if not selection or name in selected_variables:
@@ -774,7 +756,7 @@ def _add_vectors(columns: Columns, name: str, shape: tuple[int, ...], load: Call
             columns[f"{name}[{i}]"] = Column(lambda i=i: np.take(np.squeeze(load()), i, axis=axis), shape[1 - axis])
 
 
-def _read_hdf5(path: Path) -> Columns:
+def _read_hdf5(path: Path, _: Selection) -> Columns:
     """Read MATLAB 7.3, or any HDF5 file of vectors. Links are not followed: they could name any file."""
     import h5py
 
@@ -782,7 +764,7 @@ def _read_hdf5(path: Path) -> Columns:
     referring_nodes: set[Any] = set()
 
     def load_dataset(place: str) -> np.ndarray:
-        with _report_errors("a MATLAB file"), h5py.File(path) as file:
+        with h5py.File(path) as file:
             return np.asarray(file[place])
 
     def add_node(name: str, node: Any) -> None:
@@ -816,12 +798,23 @@ def _read_hdf5(path: Path) -> Columns:
                 if reference:
                     add_node(f"{name}[{i}]", node.file[reference])
 
-    with _report_errors("a MATLAB file"), h5py.File(path) as file:
+    with h5py.File(path) as file:
         add_node("", file)
     return _require_columns(columns)
 
 
 _LINKS = "links are not followed; copy the data into the file"
+_BINARY_READERS: tuple[tuple[bytes, str, str, Callable[[Path, Selection], Columns]], ...] = (
+    (rb"TDSm", "", "TDMS", read_tdms),
+    (rb"MDF", "", "MDF", read_mdf),
+    (rb"\x89MCAP", "", "MCAP", read_mcap),
+    (rb"#ROSBAG", "", "a ROS bag", read_bag),
+    (rb"PAR1", "", "Parquet", _read_parquet),
+    # MATLAB 7.3 puts half a kilobyte of text before HDF5
+    (rb"(.{512})?\x89HDF", "", "a MATLAB file", _read_hdf5),
+    (rb"", ".mat", "a MATLAB file", _read_matlab),
+)
+"""First bytes, a pattern, and ending of files of a kind, the kind as messages call it, and its reader."""
 
 
 def _require_columns(columns: Columns) -> Columns:
