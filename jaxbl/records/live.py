@@ -54,7 +54,7 @@ _OUTLIER_STEPS, _USUAL_STEPS = 100.0, 0.9
 _RECENT_ROWS = 256
 """Rows before those that arrive, which say what steps are usual."""
 _BATCH_ROWS = 2048
-"""Rows that are taken at once: what comes in a burst leaves time to hear that the watch is to end."""
+"""Rows from which on no more are taken at once: what comes in a burst leaves time to hear that the watch is to end."""
 _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 """Bytes of text; a datagram with other ones holds binary numbers."""
 
@@ -75,11 +75,9 @@ class Rows(NamedTuple):
     starts_segment: bool
 
 
-def _stream_channels(table: LogTable) -> dict[str, TimeTable | TorqueTable | PositionTable | SpeedTable]:
-    """Return the tables of the channels of a stream; without `t` if the rows have no stamps."""
-    clock = table.t or TimeTable()
-    channels = {"t": clock} if clock.period is None else {}
-    return channels | {"u": table.u or TorqueTable()} | dict(map(table.position_source, POSITION_CHANNELS.values()))
+def _stream_signals(table: LogTable) -> dict[str, TorqueTable | PositionTable | SpeedTable]:
+    """Return the tables of input, motor and load position by channel."""
+    return {"u": table.u or TorqueTable()} | dict(map(table.position_source, POSITION_CHANNELS.values()))
 
 
 def stream_columns(table: LogTable) -> list[ColumnName]:
@@ -87,9 +85,10 @@ def stream_columns(table: LogTable) -> list[ColumnName]:
 
     Time, input, motor and load position come first, then columns to be subtracted, then those of `where`.
     """
-    channels = _stream_channels(table)
-    columns = [channel_table.column_or(channel) for channel, channel_table in channels.items()]
-    columns += [end.minus for end in channels.values() if isinstance(end, PositionTable) and end.minus is not None]
+    clock, signals = table.t or TimeTable(), _stream_signals(table)
+    columns = [clock.column_or("t")] if clock.period is None else []
+    columns += [source.column_or(channel) for channel, source in signals.items()]
+    columns += [end.minus for end in signals.values() if isinstance(end, PositionTable) and end.minus is not None]
     return list(dict.fromkeys([*columns, *(table.where or {})]))
 
 
@@ -101,8 +100,8 @@ def check_stream_table(table: LogTable, name: str) -> None:
     """
     if table.absent:
         raise InputError(f"{name}: [log] absent: {', '.join(table.absent)}; a stream needs u, theta_e and theta_s")
-    channels = _stream_channels(table)
-    keys = [f"{channel}.{key}" for channel in channels for key in ("skew", "drift") if getattr(channels[channel], key, None)]
+    signals = _stream_signals(table)
+    keys = [f"{channel}.{key}" for channel in signals for key in ("skew", "drift") if getattr(signals[channel], key, None)]
     keys += [key for key in ("start", "stop", "resample") if getattr(table, key) is not None]
     # a sampled torque is known only with the next sample
     keys += ["hold"] if table.hold == "sampled" else []
@@ -116,13 +115,13 @@ class _ChannelReader:
 
     def __init__(self, table: LogTable, name: str, columns: Sequence[ColumnName]):
         self._table = table
-        self._positions = [table.position_source(name) for name in POSITION_CHANNELS.values()]
+        self._clock, self._signals = table.t or TimeTable(), _stream_signals(table)
         file = LogFile(Path(name), Columns(dict.fromkeys(columns, ())))
-        keys = {channel_table.column_or(channel): channel for channel, channel_table in _stream_channels(table).items()}
+        keys = {source.column_or(channel): channel for channel, source in [("t", self._clock), *self._signals.items()]}
         self._indices = {
             column: list(columns).index(file.find_column(column, keys.get(column, ""))) for column in stream_columns(table)
         }
-        self._last, self._places, self._row = np.empty((4, 0)), [0.0, 0.0], 0
+        self._last, self._ends, self._row = np.empty((4, 0)), np.zeros(3), 0
 
     def decode(self, values: np.ndarray, period: float) -> tuple[np.ndarray, int]:
         """Decode values (rows, columns); `period` (s) is what stamps have to resolve.
@@ -134,21 +133,18 @@ class _ChannelReader:
         for column, required in (self._table.where or {}).items():
             values = values[values[:, self._indices[column]] == required]
         columns = {column: values[:, index] for column, index in self._indices.items()}
-        clock = self._table.t or TimeTable()
-        if clock.period is not None:
-            stamps = (self._row + np.arange(len(values))) * clock.period
+        if self._clock.period is not None:
+            stamps = (self._row + np.arange(len(values))) * self._clock.period
             self._row += len(values)
         else:
-            stamps = columns[clock.column_or("t")] * SECONDS_PER_UNIT[clock.unit]
-        torque_table = self._table.u or TorqueTable()
-        signals = [stamps, to_si(torque_table, decode_words(torque_table, columns[torque_table.column_or("u")]))]
-        is_readable = np.abs(stamps) * np.finfo(float).eps < 0.5 * period
-        for channel, table in self._positions:
+            stamps = columns[self._clock.column_or("t")] * SECONDS_PER_UNIT[self._clock.unit]
+        signals, is_readable = [stamps], np.abs(stamps) * np.finfo(float).eps < 0.5 * period
+        for channel, table in self._signals.items():
             numbers = decode_words(table, columns[table.column_or(channel)])
-            if isinstance(table, PositionTable) and table.minus is not None:
-                numbers = numbers - decode_words(table, columns[table.minus])
-            elif isinstance(table, PositionTable) and table.wrap is not None:
-                is_readable &= np.abs(numbers) <= 2.0 * table.wrap
+            if (minus := getattr(table, "minus", None)) is not None:
+                numbers = numbers - decode_words(table, columns[minus])
+            elif wrap := getattr(table, "wrap", None):
+                is_readable &= np.abs(numbers) <= 2.0 * wrap
             signals.append(numbers)
         samples = np.stack(signals)
         samples = samples[:, is_readable & (np.abs(samples) <= LARGEST).all(axis=0)]
@@ -157,8 +153,8 @@ class _ChannelReader:
     def steps(self, samples: np.ndarray) -> np.ndarray:
         """Return the steps between decoded samples, shape (4, samples - 1), those of wrapped positions the shorter way."""
         steps = np.diff(samples)
-        for i, (_, table) in enumerate(self._positions, 2):
-            if isinstance(table, PositionTable) and (wrap := table.wrap) is not None:
+        for i, table in enumerate(self._signals.values(), 1):
+            if wrap := getattr(table, "wrap", None):
                 steps[i] = (steps[i] + 0.5 * wrap) % wrap - 0.5 * wrap
         return steps
 
@@ -170,18 +166,17 @@ class _ChannelReader:
             return samples
         # from the sample before on, if there is one
         numbers, before = np.concatenate([self._last, samples], axis=1), self._last.shape[1]
-        self._last, positions = samples[:, -1:], []
-        for i, (_, table) in enumerate(self._positions):
-            place = numbers[2 + i]
+        self._last, signals = samples[:, -1:], [samples[0]]
+        for i, (table, values) in enumerate(zip(self._signals.values(), numbers[1:], strict=True)):
             if isinstance(table, SpeedTable):
                 # over a gap, too, as if the speed had changed linearly
-                place = cumulative_trapezoid(to_si(table, place), numbers[0], initial=0.0)
-            elif table.wrap is not None:
-                place = np.unwrap(place, period=table.wrap)
-            place = (place + (self._places[i] - place[0] if before else 0.0))[before:]
-            self._places[i] = place[-1]
-            positions.append(place if isinstance(table, SpeedTable) else to_si(table, place))
-        return np.stack([*samples[:2], *positions])
+                values = cumulative_trapezoid(to_si(table, values), numbers[0], initial=0.0)
+            elif wrap := getattr(table, "wrap", None):
+                values = np.unwrap(values, period=wrap)
+            values = (values + (self._ends[i] - values[0] if before else 0.0))[before:]
+            self._ends[i] = values[-1]
+            signals.append(values if isinstance(table, SpeedTable) else to_si(table, values))
+        return np.stack(signals)
 
 
 class Stream:
@@ -196,14 +191,13 @@ class Stream:
         period: expected sampling period, s.
     """
 
+    _reader: _ChannelReader
+
     def __init__(self, source: "Source", table: LogTable, period: float):
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
-        self._reader: _ChannelReader | None = None
         self._columns: Sequence[ColumnName] = ()
-        self._block: Block | None = None
         self._is_period_right: bool | None = None
-        self._begin_anew()
 
     def poll(self, seconds: float) -> list[Rows]:
         """Return the rows that arrive within `seconds`.
@@ -211,47 +205,40 @@ class Stream:
         Raises:
             InputError: a column is missing, or samples come at another period, from the beginning on.
         """
-        block = self._block or self.source.poll(seconds)
+        block = self.source.poll(seconds)
         if block is None:
             return []
         columns, values = block
-        values, remaining = values[:_BATCH_ROWS], values[_BATCH_ROWS:]
-        self._block = (columns, remaining) if len(remaining) else None
         # another file begins anew, with the same names, too
         if columns is not self._columns and not self._read_columns(columns):
             self._count(OTHER_COLUMNS, len(values))
             return []
-        assert self._reader is not None
         decoded, unreadable = self._reader.decode(values, self._period)
         self._count(UNREADABLE, unreadable)
-        samples = self._reader.convert(self._leave_out_outliers(self._reader, decoded))
+        samples = self._reader.convert(self._leave_out_outliers(decoded))
         self._check_period(samples[0])
         return self._split_rows(samples)
 
     def _read_columns(self, columns: Sequence[ColumnName]) -> bool:
         """Read other columns from now on; False if there are columns that have been read, and one of these is missing."""
         try:
-            reader = _ChannelReader(self._table, self.source.name, columns)
+            self._reader = _ChannelReader(self._table, self.source.name, columns)
         except InputError as error:
-            if self._reader is None:
+            if not self._columns:
                 raise
             self.source.fault = f"; {shorten(str(error), 200)}"
             return False
-        if self._reader is not None:
-            self._begin_anew()
-        self._reader, self._columns = reader, columns
-        return True
-
-    def _begin_anew(self) -> None:
-        """Forget what was before: another sender may have another clock, period and zero."""
+        # another sender may have another clock, period and zero
         self._recent = self._held = self._last = np.empty((4, 0))
         self._first_stamps: list[float] = []
+        self._columns = columns
+        return True
 
     def _count(self, fault: str, number: int) -> None:
         if number:
-            self.counts[fault] += number
+            self.counts[fault] += int(number)
 
-    def _leave_out_outliers(self, reader: _ChannelReader, samples: np.ndarray) -> np.ndarray:
+    def _leave_out_outliers(self, samples: np.ndarray) -> np.ndarray:
         """Leave out single rows far from both neighbours, which would move the observers or the clock for long.
 
         A row at the end that is far from the one before is held until the next one has come.
@@ -260,7 +247,7 @@ class Stream:
         samples, self._held = np.concatenate([self._recent, self._held, samples], axis=1), samples[:, :0]
         is_new = np.arange(samples.shape[1]) >= recent
         if samples.shape[1] > 2:
-            steps = reader.steps(samples)
+            steps = self._reader.steps(samples)
             sizes = np.abs(steps)
             usual = np.quantile(sizes, _USUAL_STEPS, axis=1)
             # at standstill: a count
@@ -273,7 +260,7 @@ class Stream:
             is_outlier = np.vstack([is_far[:, 0] & ~is_far[:, 1], goes_back.T, is_far[:, 0] & False]).any(axis=1) & is_new
             if is_far[:, -1].any() and not is_outlier[-2]:
                 self._held, is_new[-1] = samples[:, -1:], False
-            self._count(OUTLIERS, int(is_outlier.sum()))
+            self._count(OUTLIERS, is_outlier.sum())
             is_new &= ~is_outlier
         new = samples[:, is_new]
         self._recent = np.concatenate([self._recent, new], axis=1)[:, -_RECENT_ROWS:]
@@ -317,7 +304,7 @@ class Stream:
             self._check_period(stamps[restart:])
             return [*rows, *self._split_rows(samples[:, restart:])]
         is_later = stamps > latest
-        self._count(DISORDERED, int(np.count_nonzero(~is_later)))
+        self._count(DISORDERED, np.count_nonzero(~is_later))
         # from the last sample, which was returned already, lost ones are interpolated
         samples, returned = np.concatenate([self._last, samples[:, is_later]], axis=1), self._last.shape[1]
         self._last = samples[:, -1:]
@@ -340,10 +327,9 @@ class Stream:
         received = np.cumsum(np.append(0.0, steps))
         numbers = np.arange(received[-1] + 1.0)
         self._count(LOST, len(numbers) - len(received))
-        if len(numbers) > len(received):
-            torque = torque[np.searchsorted(received, numbers, side="right") - 1]
-            positions = [np.interp(numbers, received, values) for values in positions]
-        sides = {side: values[returned:] for side, values in zip(POSITION_CHANNELS, positions, strict=True)}
+        torque = torque[np.searchsorted(received, numbers, side="right") - 1]
+        positions = [np.interp(numbers, received, values)[returned:] for values in positions]
+        sides = dict(zip(POSITION_CHANNELS, positions, strict=True))
         return Rows(float(stamps[0]) + returned * self._period, torque[returned:], sides, not returned)
 
 
@@ -449,7 +435,8 @@ class Source:
         return text_format
 
     def _add_rows(self, rows: list[list[float]]) -> None:
-        if not (self._blocks and self._blocks[-1][0] is self._columns):
+        last_columns, last_rows = self._blocks[-1] if self._blocks else ((), [])
+        if last_columns is not self._columns or len(last_rows) >= _BATCH_ROWS:
             self._blocks.append((self._columns, []))
         self._blocks[-1][1].extend(rows)
 
