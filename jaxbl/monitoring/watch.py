@@ -5,9 +5,11 @@ when the gap has grown beyond a stated size.
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import pandas as pd
@@ -20,12 +22,12 @@ from jaxbl.estimation.logs import on_record, read_logs
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import POSITION_CHANNELS, LogTable, Record
+from jaxbl.records.least_squares import student_interval
 from jaxbl.records.live import (
     Datagrams,
     FollowedFile,
     Rows,
-    Source,
     Stream,
     check_stream_table,
     period_error,
@@ -195,22 +197,16 @@ def read_watch_task(
     if record is not None and (longest := record.time[-1] - record.time[0]) < window:
         raise InputError(f"{source}: has {longest:.4g} s, window is {window:g} s; it should be shorter than the log")
     blind = BLIND_WINDOWS * window if blind is None else blind
-    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, blind, _find_units(config, record))
+    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, blind, _find_units(config.log))
 
 
-def _find_units(config: Config, record: Record | None) -> dict[str, dict[str, str]]:
-    units = {"half_gap": "rad", "stiffness": "N m/rad", "coulomb": "N m", "viscous": "N m s/rad"}
+def _find_units(log: LogTable) -> dict[str, dict[str, str]]:
+    def find_units(side: str, units: dict[str, str]) -> dict[str, str]:
+        is_linear = log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m"
+        return {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
 
-    def unit_of(side: str, unit: str) -> str:
-        if record is not None:
-            return record.unit_of(side, unit)
-        return on_a_line(unit) if config.log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m" else unit
-
-    # gap and stiffness are those of the motor's side
-    return {
-        side: {name: unit_of("motor" if name in ("half_gap", "stiffness") else side, unit) for name, unit in units.items()}
-        for side in POSITION_CHANNELS
-    }
+    law = find_units("motor", {"half_gap": "rad", "stiffness": "N m/rad"})
+    return {side: law | find_units(side, {"coulomb": "N m", "viscous": "N m s/rad"}) for side in POSITION_CHANNELS}
 
 
 def run_watch(
@@ -229,56 +225,47 @@ def run_watch(
     with jax.enable_x64(True), limit_blas_threads():
         watcher = Watcher(task, on_values or (lambda values: None))
         counts: Mapping[str, int] = {}
-        if task.record is not None:
-            for rows in _rows_of_record(task.record):
-                watcher.take(rows)
-            notes = [*task.record.warnings, *task.record.notes]
+        notes: list[str] = []
+        if (record := task.record) is None:
+            counts = _watch_stream(watcher, task, ended or (lambda: False), on_remark or (lambda text: None))
         else:
-            watcher.chain.compile()
-            stream, notes = _open_stream(task), []
-            remark = on_remark or (lambda text: None)
-            try:
-                remark(f"watching {task.name}; Ctrl+C ends it")
-                for rows in _rows_of_stream(stream, ended or (lambda: False), remark):
-                    for part in rows:
-                        watcher.take(part)
-                    watcher.check_sight()
-            finally:
-                stream.source.close()
-            counts = stream.counts
+            assert record.torque is not None
+            for part in record.segments:
+                positions = {side: values[part] for side, values in record.positions.items()}
+                watcher.take(Rows(float(record.time[part.start]), record.torque[part], positions, True))
+            notes += [*record.warnings, *record.notes]
     values = pd.DataFrame(watcher.values, columns=watcher.columns)
-    return Watch(task, to_jsonable(_summarise(task, watcher, counts, notes)), values)
+    return Watch(task, to_jsonable(_summarise(task, watcher, values, counts, notes)), values)
 
 
-def _rows_of_record(record: Record) -> Iterator[Rows]:
-    assert record.torque is not None
-    for part in record.segments:
-        positions = {side: values[part] for side, values in record.positions.items()}
-        yield Rows(float(record.time[part.start]), record.torque[part], positions, True)
-
-
-def _open_stream(task: WatchTask) -> Stream:
-    columns = stream_columns(task.config.log)
-    source: Source = Datagrams(task.name, columns) if "://" in task.name else FollowedFile(Path(task.name), columns)
-    return Stream(source, task.config.log, float(task.experiment.run.sample_period))
-
-
-def _rows_of_stream(stream: Stream, has_ended: Callable[[], bool], remark: Callable[[str], None]) -> Iterator[list[Rows]]:
+def _watch_stream(
+    watcher: "Watcher", task: WatchTask, has_ended: Callable[[], bool], remark: Callable[[str], None]
+) -> Mapping[str, int]:
+    """Take in rows as they come. Returns what was left out: its kind -> its number."""
+    watcher.chain.compile()
+    columns, period = stream_columns(task.config.log), float(task.experiment.run.sample_period)
+    source = Datagrams(task.name, columns) if "://" in task.name else FollowedFile(Path(task.name), columns)
+    stream = Stream(source, task.config.log, period)
     last_rows = last_remark = time.monotonic()
     counts_before: dict[str, int] = {}
-    while not has_ended():
-        rows = stream.poll(_POLL)
-        now = time.monotonic()
-        if rows:
-            last_rows = now
-        if now - last_remark >= _QUIET:
-            if now - last_rows >= _QUIET:
-                remark(f"{stream.source.name}: nothing that can be read has come for {now - last_rows:.0f} s")
-                last_remark = now
-            if stream.counts != counts_before:
-                remark(f"{stream.source.name}: {describe_counts(stream.counts)}{stream.source.fault}")
-                last_remark, counts_before = now, dict(stream.counts)
-        yield rows
+    with closing(source):
+        remark(f"watching {task.name}; Ctrl+C ends it")
+        while not has_ended():
+            rows = stream.poll(_POLL)
+            now = time.monotonic()
+            if rows:
+                last_rows = now
+            if now - last_remark >= _QUIET:
+                if now - last_rows >= _QUIET:
+                    remark(f"{source.name}: nothing that can be read has come for {now - last_rows:.0f} s")
+                    last_remark = now
+                if source.counts != counts_before:
+                    remark(f"{source.name}: {describe_counts(source.counts)}{source.fault}")
+                    last_remark, counts_before = now, dict(source.counts)
+            for part in rows:
+                watcher.take(part)
+            watcher.check_sight()
+    return source.counts
 
 
 def describe_counts(counts: Mapping[str, int]) -> str:
@@ -353,8 +340,8 @@ class Watcher:
             now = self._last_time = first + (end - 1) * self._period
             if now >= self._due - 0.5 * self._period:
                 self._due = self._following_due(now)
-                if self._window.is_full:
-                    self._add_values(now, self._window.estimate())
+                if (windows := self._window.estimate()) is not None:
+                    self._add_values(now, windows)
 
     def _following_due(self, now: float) -> float:
         interval = self._task.interval
@@ -389,7 +376,7 @@ class Watcher:
         task, name = self._task, self._chosen[0]
         law = task.experiment.transmission
         assert law is not None
-        nominal = float(law.half_gap if name == "half_gap" else law.stiffness)
+        nominal = float(getattr(law, name))
         numbers_by_side = {
             side: window.numbers
             for side, window in windows.items()
@@ -401,12 +388,13 @@ class Watcher:
         values: Values = {"side": side}
         for key in self._chosen:
             number = numbers_by_side[side][key]
-            ends = (number.value + sign * INTERVAL * number.standard_error for sign in (-1.0, 1.0))
-            values |= dict(zip((key, f"{key}_from", f"{key}_to"), (number.value, *ends), strict=True))
+            low, high = student_interval(number.value, number.standard_error, BLOCKS - 1)
+            values |= {key: number.value, f"{key}_from": low, f"{key}_to": high}
         differing = [
             key
+            for first, second in itertools.combinations(numbers_by_side.values(), 2)
             for key in self._chosen
-            if len(numbers_by_side) == 2 and _surely_differ(*(numbers[key] for numbers in numbers_by_side.values()))
+            if _surely_differ(first[key], second[key])
         ]
         values["contradiction"] = bool(differing)
         if name == "half_gap":
@@ -422,12 +410,14 @@ def _surely_differ(first: Quantity, second: Quantity) -> bool:
     return abs(first.value - second.value) > _BOUND * math.hypot(first.standard_error, second.standard_error)
 
 
-def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], notes: list[str]) -> JsonObject:
-    determined = [values for values in watcher.values if values["side"]]
-    alarms = [values for values in determined if values["alarm"]]
+def _summarise(
+    task: WatchTask, watcher: Watcher, values: pd.DataFrame, counts: Mapping[str, int], notes: list[str]
+) -> JsonObject:
+    determined = values[values["side"] != ""]
+    alarms = determined[determined["alarm"].astype(bool)]
 
-    def drop_nan(values: Values) -> Values:
-        return {name: value for name, value in values.items() if not (isinstance(value, float) and math.isnan(value))}
+    def list_numbers(rows: Any, i: int) -> Values | None:
+        return rows.iloc[i].dropna().to_dict() if len(rows) else None
 
     return {
         "title": task.config.title,
@@ -438,14 +428,14 @@ def _summarise(task: WatchTask, watcher: Watcher, counts: Mapping[str, int], not
         "window": task.window,
         "every": task.interval,
         "alarm_gap": task.alarm_gap,
-        "alarm": drop_nan(alarms[0]) if alarms else None,
+        "alarm": list_numbers(alarms, 0),
         "alarms": len(alarms),
-        "values": len(watcher.values),
+        "values": len(values),
         "determined": len(determined),
         "blind": {"limit": task.blind, "longest": watcher.longest_blindness},
-        "contradictions": sum(values["contradiction"] for values in determined),
-        "first": drop_nan(determined[0]) if determined else None,
-        "last": drop_nan(determined[-1]) if determined else None,
+        "contradictions": determined["contradiction"].sum(),
+        "first": list_numbers(determined, 0),
+        "last": list_numbers(determined, -1),
         "units": task.units,
         "left_out": dict(counts),
         "notes": notes,

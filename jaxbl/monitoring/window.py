@@ -30,6 +30,7 @@ from jaxbl.drive.transmission import AbstractTransmission
 from jaxbl.fused.compilation import jit
 from jaxbl.observer.equivalent_control import EquivalentControl
 from jaxbl.quantity import Quantity
+from jaxbl.records.least_squares import jackknife_variance
 from jaxbl.records.linear_filters import savitzky_golay_slopes
 
 BLOCKS = 10
@@ -121,11 +122,6 @@ class Window:
         self._rows_until_settled = 0
         self._last_estimates: dict[str, SideNumbers] = {}
 
-    @property
-    def is_full(self) -> bool:
-        """True if there are rows for the whole length, counted or not."""
-        return bool(self._rows) and len(self._rows["twist"]) == self.samples
-
     def add(self, rows: NamedArrays, restarts: bool) -> None:
         """Add rows from :meth:`.live_chain.LiveChain.take`.
 
@@ -144,23 +140,22 @@ class Window:
             name: np.concatenate([self._rows.get(name, new[:0]), new])[-self.samples :] for name, new in new_rows.items()
         }
 
-    def estimate(self) -> dict[str, SideNumbers]:
-        """Numbers of each side whose window determines them; none before the window is full."""
-        if not self.is_full:
-            return {}
+    def estimate(self) -> dict[str, SideNumbers] | None:
+        """Numbers of each side whose window determines them; None before there are rows for its whole length."""
+        if len(self._rows.get("twist", ())) < self.samples:
+            return None
         counts = self._rows["counts"].copy()
         # the filter of the regressors begins with the window; velocities at its end lack the readings after it
         counts[: max(math.ceil(SETTLING * self._constant / self._period), self._half)] = 0.0
         counts[-self._half :] = 0.0
         estimates, twist = {}, self._rows["twist"]
         for side in self._experiment.sides:
-            velocity = savitzky_golay_slopes(self._rows[f"{side}.position"], self._half) / self._period
-            rows = {"twist": twist, "rate": savitzky_golay_slopes(twist, self._half) / self._period, "velocity": velocity}
-            rows["torque"] = self._rows[f"{side}.torque"]
-            side_numbers = self._estimate_side(side, rows | {"counts": counts})
-            if side_numbers is not None:
-                estimates[side] = side_numbers
-                self._last_estimates[side] = side_numbers
+            position, torque = (self._rows[f"{side}.{name}"] for name in ("position", "torque"))
+            rate, velocity = (savitzky_golay_slopes(values, self._half) / self._period for values in (twist, position))
+            columns = {"twist": twist, "rate": rate, "velocity": velocity, "torque": torque, "counts": counts}
+            if (numbers := self._estimate_side(side, columns)) is not None:
+                estimates[side] = numbers
+        self._last_estimates |= estimates
         return estimates
 
     def _estimate_side(self, side: str, rows: NamedArrays) -> SideNumbers | None:
@@ -176,13 +171,13 @@ class Window:
             numbers = self._solve_with_errors(side, law, *map(np.asarray, sums))
             if numbers is None:
                 return None
-            shift = numbers.pop("zero")
-            gap = numbers.get("half_gap")
-            change = max(abs(shift.value), 0.0 if gap is None else abs(gap.value - float(law.half_gap)))
-            law, zero = _place_numbers(law, numbers), zero + shift.value
-            if change <= _CONVERGED * (
-                shift.standard_error if gap is None else max(gap.standard_error, shift.standard_error)
-            ):
+            shift, half_gap = numbers.pop("zero"), float(law.half_gap)
+            gap = numbers.get("half_gap", Quantity(half_gap, 0.0))
+            change = max(abs(shift.value), abs(gap.value - half_gap))
+            # a negative gap becomes zero
+            placed = {name: jnp.asarray(max(numbers[name].value, 0.0)) for name in vars(law) if name in numbers}
+            law, zero = dataclasses.replace(law, **placed), zero + shift.value
+            if change <= _CONVERGED * max(gap.standard_error, shift.standard_error):
                 return SideNumbers(numbers, law, zero)
         return None
 
@@ -196,26 +191,14 @@ class Window:
         )
         if coefficients is None:
             return None
-        values, *jackknife = (self._name_coefficients(side, law, theta) for theta in coefficients)
-        numbers = {}
-        for name, number in values.items():
-            jackknife_values = np.array([part[name] for part in jackknife])
-            error = math.sqrt((BLOCKS - 1) / BLOCKS * float(((jackknife_values - jackknife_values.mean()) ** 2).sum()))
-            if not (math.isfinite(number) and math.isfinite(error)):
-                return None
-            numbers[name] = Quantity(number, error)
-        return numbers if numbers["stiffness"].value > 0.0 else None
+        values, *without = (self._name_coefficients(side, law, theta) for theta in coefficients)
+        errors = np.sqrt(jackknife_variance(np.array([[*numbers.values()] for numbers in without])))
+        numbers = {name: Quantity(values[name], error) for name, error in zip(values, errors.tolist(), strict=True)}
+        is_determined = all(number.is_finite for number in numbers.values()) and numbers["stiffness"].value > 0.0
+        return numbers if is_determined else None
 
     def _name_coefficients(self, side: str, law: AbstractTransmission, theta: np.ndarray) -> dict[str, float]:
-        *law_coefficients, _, coulomb, viscous, _, zero = (float(coefficient) for coefficient in theta)
-        law_theta = tuple(map(np.float64, law_coefficients))
-        law_numbers = {name: float(value) for name, value in law.from_theta(law_theta).items()}  # type: ignore[arg-type]
+        *law_theta, _, coulomb, viscous, _, zero = theta
         nominal = float(self._experiment.drive.viscous(side))  # type: ignore[attr-defined]
-        return law_numbers | {"coulomb": coulomb, "viscous": nominal + viscous, "zero": zero}
-
-
-def _place_numbers(law: AbstractTransmission, numbers: dict[str, Quantity]) -> AbstractTransmission:
-    """Place estimated numbers into the law; a negative gap becomes zero."""
-    fields = {field.name for field in dataclasses.fields(law)}
-    values = {name: number.value for name, number in numbers.items() if name in fields}
-    return dataclasses.replace(law, **{name: jnp.asarray(max(value, 0.0)) for name, value in values.items()})
+        numbers = law.from_theta(tuple(law_theta)) | {"coulomb": coulomb, "viscous": nominal + viscous, "zero": zero}
+        return {name: float(value) for name, value in numbers.items()}
