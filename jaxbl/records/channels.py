@@ -23,7 +23,7 @@ class RawChannel(NamedTuple):
     Attributes:
         values: shape (rows,).
         unit: rad, m, N m or N.
-        skew: delay of the stamps against the values, s; "estimate": to be estimated.
+        skew: delay of the stamps against the values at time 0, s; 0 where it is to be estimated.
         saturated: share of rows at the saturation level that `[log]` gives.
         hold: `[log] hold` of a torque that acts on the drive; None for what is only measured.
         drift: growth of the skew, s/s.
@@ -31,10 +31,14 @@ class RawChannel(NamedTuple):
 
     values: np.ndarray
     unit: str
-    skew: float | str
+    skew: float
     saturated: float = 0.0
     hold: Literal["zoh", "sampled"] | None = None
     drift: float = 0.0
+
+    def undo_delay(self, stamps: np.ndarray) -> np.ndarray:
+        """Return the times of readings with these stamps, s."""
+        return stamps - (self.skew + self.drift * stamps)
 
 
 def read_channels(file: LogFile, table: LogTable, stamps: TimeStamps) -> dict[str, RawChannel]:
@@ -167,14 +171,14 @@ def _read_position(file: LogFile, name: str, table: PositionTable, stamps: TimeS
     values = to_si(table, values)
     if np.ptp(values) < _LEAST_MOTION:
         raise file.error(f"{name} moves by only {np.ptp(values):.3g} {table.si_unit}; see its unit and factor in [log]")
-    return RawChannel(values, table.si_unit, table.skew or 0.0, drift=table.drift or 0.0)
+    return RawChannel(values, table.si_unit, table.given_skew, drift=table.drift or 0.0)
 
 
 def _read_reference(file: LogFile, table: PositionTable, stamps: TimeStamps) -> RawChannel:
     """Read what a controller was given: it may stand still or jump."""
     values = _read_numbers(file, "reference", table, stamps)
     values = to_si(table, _unwrap(file, "reference", table, values))
-    return RawChannel(values, table.si_unit, table.skew or 0.0)
+    return RawChannel(values, table.si_unit, table.given_skew)
 
 
 def _integrate_speed(file: LogFile, name: str, channel: str, table: SpeedTable, stamps: TimeStamps) -> RawChannel:
@@ -248,7 +252,7 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
         # levels of a stepping or random input look like dropouts now and then
         if not max(3.0, 0.5 * len(starts)) <= is_clear.sum() <= _MAX_DROPOUT_SHARE * len(values):
             continue
-        rows = np.concatenate([np.arange(*run) for run in zip(starts[is_clear], stops[is_clear], strict=True)])
+        rows = np.r_[*map(slice, starts[is_clear], stops[is_clear])]
         kept_times, kept_values = np.delete(stamps.times, rows), np.delete(values, rows)
         values = values.copy()
         values[rows] = np.interp(stamps.times[rows], kept_times, kept_values)

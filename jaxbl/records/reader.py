@@ -30,7 +30,7 @@ from .plausibility import (
     note_host_stamps,
     note_standstill,
 )
-from .resampling import Delay, Grid, resample_channels
+from .resampling import Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import (
     ChannelStatistics,
@@ -232,7 +232,7 @@ def _resample_and_align(
     file: LogFile,
     table: LogTable,
     segmented: SegmentedStamps,
-    channels: Mapping[str, RawChannel],
+    channels: dict[str, RawChannel],
     encoders: Sequence[str],
     gear_ratio: float | None,
     nominal: NominalDrive | None,
@@ -246,10 +246,9 @@ def _resample_and_align(
     """
     period = table.resample or segmented.period
     regular = segmented.sampling.even and math.isclose(period, segmented.period, rel_tol=1e-9)
-    delays = {name: Delay(raw.skew if isinstance(raw.skew, float) else 0.0, raw.drift) for name, raw in channels.items()}
 
     def resample() -> tuple[Grid, Gearing | None]:
-        grid = resample_channels(file, segmented, channels, period, delays, interpolate=not regular)
+        grid = resample_channels(file, segmented, channels, period, interpolate=not regular)
         if table.kind == "element" or len(encoders) < 2:
             return grid, None
         turn = math.inf if channels["theta_s"].unit == "m" else 2.0 * math.pi
@@ -261,20 +260,19 @@ def _resample_and_align(
         lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
         if lateness is not None and (keys := _find_torque_keys(file, table, lateness, nominal, segmented.period)):
             hold, skew = keys
-            channels = {**channels, "u": channels["u"]._replace(hold=hold)}
-            delays["u"] = Delay(skew)
+            channels["u"] = channels["u"]._replace(hold=hold, skew=skew)
             file.corrections |= {"u.skew": skew, "u.sampled": float(hold == "sampled")}
             late = skew + (0.5 * segmented.period if hold == "sampled" else 0.0)
             lateness = lateness._replace(value=lateness.value - late)
             grid, gearing = resample()
-    is_estimated = any(raw.skew == "estimate" for raw in channels.values())
+    is_estimated = table.theta_s is not None and table.theta_s.skew == "estimate"
     shaft = shaft if _is_left_out(table, "skew") else None
     sentences = []
     if gearing is not None and (is_estimated or shaft is not None) and _is_left_out(table, "drift"):
         drift = _find_clock_drift(gearing, grid.first(share), shaft)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
-            delays["theta_s"] = Delay(-drift.value * middle, drift.value)
+            channels["theta_s"] = channels["theta_s"]._replace(skew=-drift.value * middle, drift=drift.value)
             grid, gearing = resample()
             sentences.append(
                 f"The clocks drift apart: theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± "
@@ -293,22 +291,23 @@ def _resample_and_align(
                 f"{1e3 * clock_skew.max_windup_delay:.2g} ms, so this was corrected."
             )
     if skew:
-        delays["theta_s"] = delays["theta_s"]._replace(skew=delays["theta_s"].skew + skew)
+        channels["theta_s"] = channels["theta_s"]._replace(skew=channels["theta_s"].skew + skew)
         grid, gearing = resample()
     if sentences:
-        file.warnings.append(" ".join([*sentences, _describe_delay_keys(table, delays["theta_s"])]))
+        file.warnings.append(" ".join([*sentences, _describe_delay_keys(table, channels["theta_s"])]))
     if shaft is not None:
-        file.corrections |= {key: correction for key, correction in delays["theta_s"]._asdict().items() if correction}
+        load = channels["theta_s"]
+        file.corrections |= {key: value for key, value in (("skew", load.skew), ("drift", load.drift)) if value}
     if not regular:
         purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
         file.notes.append(
             f"Resampled {purpose}: every {1e3 * period:.6g} ms, in the log every {1e3 * segmented.period:.6g} ms; positions "
             "by cubic splines, torques by means that keep their integral."
         )
-    for name, delay in delays.items():
-        if any(delay):
-            growth = f", growing by {1e6 * delay.drift:.4g} us each second" if delay.drift else ""
-            file.notes.append(f"{name}: shifted by its skew of {1e3 * delay.skew:.4g} ms{growth}.")
+    for name, raw in channels.items():
+        if raw.skew or raw.drift:
+            growth = f", growing by {1e6 * raw.drift:.4g} us each second" if raw.drift else ""
+            file.notes.append(f"{name}: shifted by its skew of {1e3 * raw.skew:.4g} ms{growth}.")
     return grid, gearing, regular, lateness
 
 
@@ -379,11 +378,11 @@ def _describe_delay(value: float, error: float) -> str:
     return f"{1e3 * abs(value):.3g} ± {1e3 * error:.1g} ms {'later' if value > 0.0 else 'earlier'}"
 
 
-def _describe_delay_keys(table: LogTable, delay: Delay) -> str:
+def _describe_delay_keys(table: LogTable, load: RawChannel) -> str:
     """Describe the keys of `[log]` that would correct the same skew."""
     name, _ = table.position_source("theta_s")
-    drift_key = f" (at the first stamp) and {name}.drift = {delay.drift:.4g}" if delay.drift else ""
-    return f"[log] {name}.skew = {delay.skew:.4g}{drift_key} corrects the same; 0 corrects nothing."
+    drift_key = f" (at the first stamp) and {name}.drift = {load.drift:.4g}" if load.drift else ""
+    return f"[log] {name}.skew = {load.skew:.4g}{drift_key} corrects the same; 0 corrects nothing."
 
 
 def _correct_offset(

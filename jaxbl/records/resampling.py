@@ -36,23 +36,11 @@ class Grid(NamedTuple):
         return self._replace(segments=segments_before(self.segments, round(share * len(self.time))))
 
 
-class Delay(NamedTuple):
-    """Delay of a channel's stamps against its readings: `skew` (s) at time 0, which grows by `drift` (s/s)."""
-
-    skew: float = 0.0
-    drift: float = 0.0
-
-    def at(self, times: np.ndarray) -> np.ndarray:
-        """Return the delay at `times`, s, shape (times,)."""
-        return self.skew + self.drift * times
-
-
 def resample_channels(
     file: LogFile,
     segmented: SegmentedStamps,
     channels: Mapping[str, RawChannel],
     period: float,
-    delays: Mapping[str, Delay],
     *,
     interpolate: bool,
 ) -> Grid:
@@ -65,19 +53,20 @@ def resample_channels(
         InputError: all segments are too short for the period and the skews.
     """
     times, values, short = [], {name: [] for name in channels}, []
+    are_late = {name: bool(raw.skew or raw.drift) for name, raw in channels.items()}
     for segment in segmented.segments:
         stamps = segmented.times[segment]
         first = float(stamps[0])
-        if not interpolate and not any(map(any, delays.values())):
+        if not interpolate and not any(are_late.values()):
             grid = first + period * np.arange(len(stamps), dtype=float)
         else:
-            grid = _common_times(file, stamps, period, delays.values(), None if interpolate else first)
+            grid = _common_times(file, stamps, period, channels.values(), None if interpolate else first)
         if len(grid) < MIN_SAMPLES // 2:
             short.append((len(grid), first))
             continue
         for name, raw in channels.items():
-            readings, reading_times = raw.values[segment], stamps - delays[name].at(stamps)
-            is_on_grid = not interpolate and not any(delays[name]) and len(grid) == len(stamps)
+            readings, reading_times = raw.values[segment], raw.undo_delay(stamps)
+            is_on_grid = not interpolate and not are_late[name] and len(grid) == len(stamps)
             if raw.hold and not (is_on_grid and raw.hold == "zoh"):
                 readings = _hold_over_periods(reading_times, readings, grid, period, raw.hold)
             elif not is_on_grid:
@@ -100,10 +89,10 @@ def resample_channels(
 
 
 def _common_times(
-    file: LogFile, stamps: np.ndarray, period: float, delays: Iterable[Delay], first: float | None
+    file: LogFile, stamps: np.ndarray, period: float, channels: Iterable[RawChannel], first: float | None
 ) -> np.ndarray:
     """Return evenly spaced times at which all channels have values, s; on the grid from `first`, unless it is None."""
-    begins, ends = np.transpose([stamps[[0, -1]] - delay.at(stamps[[0, -1]]) for delay in delays])
+    begins, ends = np.transpose([raw.undo_delay(stamps[[0, -1]]) for raw in channels])
     begin, end = begins.max(), ends.min()
     if first is not None:
         # the samples of channels without skew lie on this grid

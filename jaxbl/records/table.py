@@ -128,6 +128,11 @@ class PositionTable(_MotionTable):
             raise table_error(f"counts_per_turn is for unit counts, not for {self.unit}")
         return self
 
+    @property
+    def given_skew(self) -> float:
+        """The skew, s; 0 where it is left out or to be estimated."""
+        return self.skew if isinstance(self.skew, float) else 0.0
+
 
 class SpeedTable(_MotionTable):
     """A speed that was recorded in place of a position; the position is its integral."""
@@ -238,16 +243,17 @@ class LogTable(StrictTable):
         if self.kind == "element":
             if "u" in absent or "theta_e" in absent:
                 raise table_error(f"absent: {ELEMENT_NEEDS}")
-            if self.omega_e is not None or self.omega_s is not None or self.transmitted or self.reference:
+            if any((self.omega_e, self.omega_s, self.transmitted, self.reference)):
                 raise table_error(
                     "an element has a displacement (theta_e, theta_s) and a torque u, no speed, transmitted or reference"
                 )
         if "theta_e" in absent and "theta_s" in absent:
             raise table_error("absent: a log without theta_e and theta_s has no position; one of them is needed")
-        if self.theta_e is not None and self.theta_e.skew == "estimate":
-            raise table_error(
-                "theta_e.skew: 'estimate' is for theta_s, whose skew is found against theta_e; give that of theta_e in s"
-            )
+        for name, channel in (("theta_e", self.theta_e), ("reference", self.reference)):
+            if channel is not None and channel.skew == "estimate":
+                raise table_error(
+                    f"{name}.skew: 'estimate' is for theta_s, whose skew is found against theta_e; give that of {name} in s"
+                )
         if self.theta_s is not None and self.theta_s.skew == "estimate" and "theta_e" in absent:
             raise table_error("theta_s.skew: 'estimate' needs theta_e, which is said to be absent; give the skew in s")
         return self

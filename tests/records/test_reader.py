@@ -632,6 +632,7 @@ TABLES = {
     "no position": ({"absent": ["theta_e", "theta_s"]}, "log: absent: .* one of them is needed"),
     "skew": ({"theta_s": {"skew": "guess"}}, "log.theta_s.skew: should be a number of seconds or 'estimate', not 'guess'"),
     "skew of the motor": ({"theta_e": {"skew": "estimate"}}, "log: theta_e.skew: 'estimate' is for theta_s"),
+    "skew of a reference": ({"reference": {"skew": "estimate"}}, "log: reference.skew: 'estimate' is for theta_s"),
     "skew against nothing": ({"theta_s": {"skew": "estimate"}, "absent": ["theta_e"]}, "'estimate' needs theta_e"),
     "where": ({"where": {"mode": [1]}}, r"log.where.mode: should be a number, text, true or false, not \[1\]"),
     "absent": ({"absent": ["v"]}, r"log.absent\[0\]: should be 'u', 'theta_e' or 'theta_s', not 'v'"),
