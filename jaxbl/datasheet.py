@@ -108,9 +108,9 @@ class Item(NamedTuple):
             # zero of anything
             unit = next(iter(units_by_spelling))
         if unit not in units_by_spelling:
-            known = ", ".join(filter(None, self.units)) or "none"
-            fault = f"the unit '{match[2]}' is not known here; known" if unit else f"has no unit; such as {example}; units"
-            raise InputError(f"{self.option} '{text}': {fault}: {known}")
+            allowed = ", ".join(filter(None, self.units)) or "none"
+            fault = f"the unit '{match[2]}' is not allowed here; known" if unit else f"has no unit; such as {example}; units"
+            raise InputError(f"{self.option} '{text}': {fault}: {allowed}")
         name, factor = units_by_spelling[unit]
         try:
             value = factor(number) if callable(factor) else factor * number

@@ -161,12 +161,12 @@ def _variants(name: str, log: Scales) -> Iterator[Candidate]:
 
 def release(name: str, numbers: Numbers, log: Scales) -> list[Candidate]:
     """An effect that a model has, at the trial values of numbers that it holds."""
-    if EFFECTS[name].released(numbers):
+    if EFFECTS[name].list_released(numbers):
         return []
     fixed = {leaf: value for leaf, value in numbers.items() if leaf not in EFFECTS[name].sizes()}
     trials = {leaf: role.trials(log) for leaf, role in EFFECTS[name].roles().items() if role.kind == "held"}
     finer = [fixed | dict(zip(trials, values, strict=True)) for values in itertools.product(*trials.values())]
-    return [_proportional(name, law, log) for law in finer if EFFECTS[name].released(law)]
+    return [_proportional(name, law, log) for law in finer if EFFECTS[name].list_released(law)]
 
 
 def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:

@@ -316,7 +316,7 @@ class EffectSearch:
     def _identify(self, fitted: FittedModel) -> tuple[bool, frozenset[tuple]]:
         """Tell models apart by what is known of the numbers, by their effects, and by the waves of these."""
         laws = (
-            (name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].released(numbers))
+            (name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].list_released(numbers))
             for name, numbers in fitted.numbers.items()
         )
         return self.fits is self.rough, frozenset(laws)
@@ -380,17 +380,17 @@ class EffectSearch:
         old = {name: numbers for name, numbers in current.numbers.items() if not any(replaces(other, name) for other in new)}
         announce(f"trying {' + '.join([*old, *new])}")
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
-        tried = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
-        fitted = self._simplify(tried)
+        as_proposed = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
+        fitted = self._simplify(as_proposed)
         left = [name for name in old if name in fitted.names or any(contains(name, plain) for plain in fitted.names)]
         added = [
             name
             for name, values in fitted.numbers.items()
-            if (name not in current.names or EFFECTS[name].released(values))
+            if (name not in current.names or EFFECTS[name].list_released(values))
             and not any(other == name or contains(other, name) for other in left)
         ]
         if not added:
-            return Trial(tuple(new), tried, self.gain(current, tried))
+            return Trial(tuple(new), as_proposed, self.gain(current, as_proposed))
         if len(left) < len(old):
             # what went stood for the new ones: they are compared with the model that has neither
             current = self._refit(current, {name: old[name] for name in left})

@@ -33,9 +33,9 @@ def describe_history(history: Sequence[Step]) -> list[JsonObject]:
 def describe_change(before: Mapping[str, Numbers], after: Mapping[str, Numbers]) -> str:
     """Say which effects one model has that another has not, or numbers that are held by default: `add A`, `remove A`,
     `replace A by B`."""
-    both = before.keys() & after.keys()
+    common = before.keys() & after.keys()
     parts = [
-        {*model, *(f"{name}.{leaf}" for name in both for leaf in EFFECTS[name].released(model[name]))}
+        {*model, *(f"{name}.{leaf}" for name in common for leaf in EFFECTS[name].list_released(model[name]))}
         for model in (before, after)
     ]
     gone, new = (" and ".join(sorted(a - b)) for a, b in (parts, parts[::-1]))

@@ -512,7 +512,7 @@ class Linear:
         return all(
             numbers[leaf] <= np.exp(REACH) * max(role.trials(log), default=np.inf)
             for leaf, role in EFFECTS[name].roles().items()
-            if role.kind == "shape" or leaf in EFFECTS[name].released(numbers)
+            if role.kind == "shape" or leaf in EFFECTS[name].list_released(numbers)
         )
 
     def torque_share(self, effect: AbstractEffect, *plain: AbstractEffect) -> float:

@@ -156,7 +156,7 @@ class _Fit:
         self.free, self.added = (*fits.free, *free), np.array(theta)
         self.width = np.concatenate([prior, width])
         choices = sum(fits.given.choices(name) for name in numbers)
-        general = sum(is_finer_law(name) + bool(EFFECTS[name].released(numbers[name])) for name in numbers)
+        general = sum(is_finer_law(name) + bool(EFFECTS[name].list_released(numbers[name])) for name in numbers)
         self.log_odds = fits.log_odds + LIMITS.effect_odds * len(numbers) + LIMITS.general_odds * general - choices
 
     def at(self, theta: np.ndarray, start: Arrays, smoothness: Sequence[float]) -> FitPoint:
@@ -355,7 +355,7 @@ def paths_of(effects: EffectNumbers) -> list[str]:
         f"effects.{name}.{leaf}"
         for name, numbers in effects.items()
         for leaf, role in EFFECTS[name].roles().items()
-        if role.kind not in ("harmonic", "held") or leaf in EFFECTS[name].released(numbers)
+        if role.kind not in ("harmonic", "held") or leaf in EFFECTS[name].list_released(numbers)
     ]
 
 

@@ -127,19 +127,19 @@ def run_element(task: ElementTask) -> ElementIdentification:
             "and fro"
         )
     stiffness = element.numbers["stiffness"]
-    shown = {name: number for name, number in element.numbers.items() if name not in element.open}
-    if "stiffness" not in shown or stiffness.value <= 0.0:
-        determined = sorted(shown.keys() - {"stiffness", "offset", "centre"})
-        remark = "".join(f"; what it shows: {name} {shown[name]}" for name in determined)
+    determined = {name: number for name, number in element.numbers.items() if name not in element.open}
+    if "stiffness" not in determined or stiffness.value <= 0.0:
+        names = sorted(determined.keys() - {"stiffness", "offset", "centre"})
+        remark = "".join(f"; what it shows: {name} {determined[name]}" for name in names)
         raise InputError(
             f"{record.path}: the torque does not follow the displacement (stiffness {stiffness}){remark}; "
             "see columns and signs in [log]"
         )
     trace = pd.DataFrame({"t": record.time, "u": log.torque, "displacement": log.position, "torque": element.torque})
-    return ElementIdentification(task, element, to_jsonable(_summary(task, element, shown)), trace, _tables(shown))
+    return ElementIdentification(task, element, to_jsonable(_summary(task, element, determined)), trace, _tables(determined))
 
 
-def _summary(task: ElementTask, element: Element, shown: Mapping[str, Quantity]) -> JsonObject:
+def _summary(task: ElementTask, element: Element, determined: Mapping[str, Quantity]) -> JsonObject:
     record = task.record
     summary = {
         "title": f"Transmission of {record.path.name}",
@@ -148,7 +148,7 @@ def _summary(task: ElementTask, element: Element, shown: Mapping[str, Quantity])
         "file": str(record.path.resolve()),
         "samples": len(record.time),
         "sample_period": record.sample_period,
-        "parameters": {_PATHS.get(name, name): number.to_dict() | {"nominal": None} for name, number in shown.items()},
+        "parameters": {_PATHS.get(name, name): number.to_dict() | {"nominal": None} for name, number in determined.items()},
         "refused": [
             {"direction": {_PATHS.get(name, name): 1.0}, "why": "this log leaves it open by more than half of its value"}
             for name in element.open
@@ -156,7 +156,7 @@ def _summary(task: ElementTask, element: Element, shown: Mapping[str, Quantity])
         "method": {"element": {"terms": element.model.terms, "gains": element.gains, "reversals": element.reversals}},
         "torque": {"element": {"rms": element.residual, "relative": element.share, "unit": element.numbers["offset"].unit}},
         "warnings": record.warnings,
-        "notes": [*record.notes, *([_SLIP_NOTE] if "slip" in shown else [])],
+        "notes": [*record.notes, *([_SLIP_NOTE] if "slip" in determined else [])],
     }
     if task.holdout is not None:
         error = element_error(element, make_rig_log(task.holdout.open(), task.gear_ratio))
@@ -165,14 +165,14 @@ def _summary(task: ElementTask, element: Element, shown: Mapping[str, Quantity])
     return summary
 
 
-def _tables(shown: Mapping[str, Quantity]) -> JsonObject:
-    transmission: JsonObject = {"law": (DeadZone if "half_gap" in shown else LinearShaft).name}
+def _tables(determined: Mapping[str, Quantity]) -> JsonObject:
+    transmission: JsonObject = {"law": (DeadZone if "half_gap" in determined else LinearShaft).name}
     effects: dict[str, JsonObject] = {}
     for name, path in _PATHS.items():
-        if name in shown:
+        if name in determined:
             owner, _, key = path.removeprefix("effects.").rpartition(".")
             table = transmission if owner == "transmission" else effects.setdefault(owner, {"kind": owner})
-            table[key] = shown[name].value
+            table[key] = determined[name].value
     # a hysteresis whose length is open has no torque that a study could simulate
     complete = [effect for kind, effect in effects.items() if not kind.endswith(Hysteresis.kind) or len(effect) == 3]
     return {"transmission": transmission} | ({"effects": complete} if complete else {})

@@ -65,11 +65,11 @@ def _derive_numbers(experiment: Experiment, search_fit: SearchFit) -> JsonObject
     if experiment.transmission is None:
         return {}
 
-    own = leaf_paths(experiment)
+    paths = leaf_paths(experiment)
 
     def compute_others(theta: jax.Array) -> JsonObject:
         law: Any = set_free_parameters(experiment, search_fit.free, theta).transmission
-        return {name: value for name, value in law.truth().items() if f"transmission.{name}" not in own}
+        return {name: value for name, value in law.truth().items() if f"transmission.{name}" not in paths}
 
     values, slopes = (of(jnp.asarray(search_fit.fit.theta)) for of in (compute_others, jax.jacfwd(compute_others)))
     derived = {}

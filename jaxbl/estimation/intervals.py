@@ -184,7 +184,7 @@ def profile(
     # residuals of noise alone have variance 1; what one of them counts follows from its correlation with its neighbours
     worth, profiles = float(width.variance) * width.inflation**2, {}
     for i, parameter in enumerate(free):
-        ends, tried = [], [(0.0, 0.0)]
+        ends, profile_points = [], [(0.0, 0.0)]
         for sign in (-1.0, 1.0):
             step, direction = np.sqrt(LIMIT * covariance[i, i]), covariance[:, i] / covariance[i, i]
             points = [(0.0, 0.0)]
@@ -202,9 +202,9 @@ def profile(
                 step *= np.clip(factor, 0.3, 3.0)
             reach = sign * step_at_limit(points)
             ends.append(float(parameter.value(centre[i] + reach)) if np.isfinite(reach) else reach)
-            tried += [(sign * step, deviance) for step, deviance in points[1:]]
+            profile_points += [(sign * step, deviance) for step, deviance in points[1:]]
         low = ends[0] if parameter.minimum is None else max(ends[0], parameter.minimum)
-        steps, deviances = np.array(sorted(tried)).T
+        steps, deviances = np.array(sorted(profile_points)).T
         profiles[parameter.path] = Profile((low, ends[1]), parameter.value(centre[i] + steps), deviances)
     return profiles
 

@@ -156,7 +156,7 @@ class UnseenLoad:
 
     @property
     def travel(self) -> float:
-        """Of the motor, rad."""
+        """Range of the motor's positions in the part with the largest, rad."""
         return float(max(np.ptp(segment.readings["motor"]) for segment in self.segments))
 
     def beginnings(self) -> list[np.ndarray]:

@@ -235,9 +235,9 @@ def widen_positions(block: Block) -> Block:
         """A routine that first moves the references, or puts them where the positions are if it has no state."""
         leader = [port.name for port in ports].index(references[0].inputs[0])
 
-        def count_from_references(numbers: Leaves, state: Leaves, origins: Leaves, given: Leaves) -> Leaves:
+        def count_from_references(numbers: Leaves, state: Leaves, origins: Leaves, inputs: Leaves) -> Leaves:
             origins = origins or [jnp.zeros((), double)] * len(references)
-            steps = (given[leader] - origins[0]) / references[0].step
+            steps = (inputs[leader] - origins[0]) / references[0].step
 
             def follow(state: Leaves, origins: Leaves) -> tuple[Leaves, Leaves]:
                 whole_steps = (steps + _WHOLE) - _WHOLE
@@ -247,7 +247,7 @@ def widen_positions(block: Block) -> Block:
 
             is_far = (jnp.abs(steps) >= 1.0) & (jnp.abs(steps) < _FARTHEST)
             state, origins = jax.lax.cond(is_far, follow, lambda *unmoved: unmoved, state, origins)
-            near = shift(operator.sub, ports, given, origins, block.dtype)
+            near = shift(operator.sub, ports, inputs, origins, block.dtype)
             results = jaxpr_as_fun(routine)(*numbers, *state, *near)
             new, outputs = results[: len(block.state)], results[len(block.state) :]
             outer = shift(operator.add, block.outputs[: len(outputs)], outputs, origins, double)

@@ -77,7 +77,7 @@ def _plain(leaf: Any) -> Any:
 
 
 def _shape(array: Any) -> jax.ShapeDtypeStruct:
-    """What stands in the place of an array. Of NumPy's none is weak."""
+    """Make what stands in the place of an array. Of NumPy's none is weak."""
     is_weak = isinstance(array, jax.Array) and array.aval.weak_type
     return _make_shape(array.shape, array.dtype, weak_type=is_weak)
 

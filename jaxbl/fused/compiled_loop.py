@@ -64,11 +64,11 @@ class ScannedLoop:
 
     def run(self, steps: int, lanes: int = 1, **inputs: ArrayGroup) -> tuple[ArrayGroup, ArrayGroup, ArrayGroup]:
         """Take lanes through all samples, as a compiled loop does."""
-        given = inputs.pop("outputs", ())
+        buffers = inputs.pop("outputs", ())
         with jax.enable_x64(True):
             groups = {name: [*map(jnp.asarray, arrays)] for name, arrays in inputs.items()}
             carry, outputs = self._program(groups, steps=steps, lanes=lanes)
-        for array, output in zip(given, outputs, strict=False):
+        for array, output in zip(buffers, outputs, strict=False):
             array[...] = output
         return np.asarray(carry), np.asarray(outputs), ()
 
@@ -79,8 +79,8 @@ class ScannedLoop:
         move_lanes = jax.vmap(functools.partial(self._sample, **tables), axes, axis_size=lanes)
 
         def advance(carry: Leaves, inputs: dict[str, Leaves]) -> tuple[Leaves, Leaves]:
-            given = groups | inputs | {"carry": carry}
-            arguments = [jax.tree.structure(numbers).unflatten(given[name]) for name, numbers in self._examples.items()]
+            arrays = groups | inputs | {"carry": carry}
+            arguments = [jax.tree.structure(numbers).unflatten(arrays[name]) for name, numbers in self._examples.items()]
             leaves = jax.tree.leaves(move_lanes(*arguments))
             return leaves[: len(carry)], leaves[len(carry) :]
 

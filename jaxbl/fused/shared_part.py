@@ -120,11 +120,11 @@ class SharedPartLoop:
             columns |= zip(group, np.asarray(rows)[:, :count], strict=True)
         stateless_count, ordered = self._needs_state.count(False), [columns[i] for i in range(len(columns))]
         stateless, loop_inputs = iter(ordered[:stateless_count]), ordered[stateless_count:]
-        found = (), (), ()
+        columns_by_role = (), (), ()
         if self._loop is not None:
             carry = [np.array([leaf]) for leaf in state]
-            found = self._loop.run(count, block_length=part.block_length, carry=carry, sample_inputs=loop_inputs)
-        state, loop_outputs, block_outputs = ([column[..., 0] for column in columns] for columns in found)
+            columns_by_role = self._loop.run(count, block_length=part.block_length, carry=carry, sample_inputs=loop_inputs)
+        state, loop_outputs, block_outputs = ([column[..., 0] for column in columns] for columns in columns_by_role)
         stateful = iter(loop_outputs)
         sample_outputs = [next(stateful if needs_state else stateless) for needs_state in self._needs_state]
         return state, block_outputs, sample_outputs

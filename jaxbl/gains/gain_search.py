@@ -206,8 +206,8 @@ class GainSearch:
         worst = worst.assign(f_plus=bound, margin_alpha=worst["alpha"] / bound, margin_exact=worst["lambda"] / least)
         # a maximum that leaves out failed runs is not the worst
         worst.loc[~worst["converged"], "convergence_time"] = np.nan
-        kept = ["lambda", "alpha", "converged", "finite", "scatter"]
-        worst.loc[~worst["finite"], worst.columns.difference(kept)] = np.nan
+        columns = ["lambda", "alpha", "converged", "finite", "scatter"]
+        worst.loc[~worst["finite"], worst.columns.difference(columns)] = np.nan
         return worst
 
     def _mark_feasible(self, side: str, candidates: pd.DataFrame) -> pd.DataFrame:

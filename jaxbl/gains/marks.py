@@ -104,8 +104,11 @@ def _explain_convergence(lambda_: float, alpha: float, disturbance: Disturbance,
     if 0.0 < least < np.inf:
         # far enough above the least frequency
         cycle["frequency"] = frequency = 2.0 * least
-        for name, found in (("predicted", sine.predict_cycle(frequency)), ("simulated", sine.simulate_cycle(frequency))):
-            cycle[name] = found and found._asdict()
+        for name, sine_cycle in (
+            ("predicted", sine.predict_cycle(frequency)),
+            ("simulated", sine.simulate_cycle(frequency)),
+        ):
+            cycle[name] = sine_cycle and sine_cycle._asdict()
     return explanation | {"sine_cycle": cycle}
 
 

@@ -168,11 +168,11 @@ class _KindSearch:
                     worst = errors.max(axis=1).reshape(len(searches), len(unit))
                     for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
                         sides[side].zoom_in(trial[side], trial_errors)
-            found = [point for point in points if all(search.best for search in point.searches[kind].values())]
-            rows = [(point, {side: search.best for side, search in point.searches[kind].items()}) for point in found]
+            solved = [point for point in points if all(search.best for search in point.searches[kind].values())]
+            rows = [(point, {side: search.best for side, search in point.searches[kind].items()}) for point in solved]
             errors_by_side = self._run_trials(kind, f"{number}-holdout", rows, held_out=True) if rows else {}
             for side, errors in errors_by_side.items():
-                for point, held_out in zip(found, errors, strict=True):
+                for point, held_out in zip(solved, errors, strict=True):
                     point.searches[kind][side].held_out = held_out
 
     def _start_searches(self, kind: str, point: MapPoint) -> dict[str, SideSearch]:

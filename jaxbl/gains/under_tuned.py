@@ -26,7 +26,7 @@ _STARTING_SHARE = 1e-3
 
 
 class Disturbance(NamedTuple):
-    """What acts on the error: d (rad/s^2) at evenly spaced times (s), linear between them, and damping of x2 (1/s).
+    """Disturbance of an error: d (rad/s^2) at evenly spaced times (s), linear between them, and damping of x2 (1/s).
 
     The arrays have one shape (n,).
     """

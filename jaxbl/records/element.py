@@ -367,8 +367,8 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> 
         low, high = np.array([scale_shapes(name, _SHAPE_BOUNDS[name]) for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
-        known = {} if near is None else near.shapes
-        choices = ([known[name]] if name in known else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
+        near_shapes = {} if near is None else near.shapes
+        choices = ([near_shapes[name]] if name in near_shapes else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
         starts = sorted(map(np.array, itertools.product(*choices)), key=lambda start: rms(compute_residual(start, few)))
         solutions = [search(start, args=(few,)) for start in starts[:3]]
         best = min(solutions, key=lambda solution: solution.cost)

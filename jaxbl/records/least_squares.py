@@ -60,12 +60,12 @@ class BlockRegression:
 
     def select(self, columns: Sequence[int] | np.ndarray, fixed: Sequence[int] = ()) -> "BlockRegression":
         """Keep some columns; those whose coefficient is `fixed` at 1 are taken off the target."""
-        index, known = [*columns, *fixed, -1], slice(len(columns), -1)
+        index, fixed_columns = [*columns, *fixed, -1], slice(len(columns), -1)
         products = self.products[:, index][:, :, index]
         # each new column as a sum of these
         sums = np.eye(len(index))
-        sums[known, -1] = -1.0
-        sums = np.delete(sums, known, axis=1)
+        sums[fixed_columns, -1] = -1.0
+        sums = np.delete(sums, fixed_columns, axis=1)
         return BlockRegression(sums.T @ products @ sums, self.counts)
 
     def fit(self, left_out: Sequence[int] | np.ndarray = ()) -> np.ndarray:

@@ -128,7 +128,7 @@ def _contradiction_lines(summary: JsonObject) -> Lines:
     """Numbers that the logs do not agree on."""
     numbers = []
     for number in summary["contradictions"]:
-        values = [f"{Quantity.read(by | {'unit': number['unit']})} by {by['log']}" for by in number["logs"]]
+        values = [f"{Quantity.read(by_log | {'unit': number['unit']})} by {by_log['log']}" for by_log in number["logs"]]
         numbers.append(f"{number['parameter']} is {' and '.join(values)}")
     sentence = (
         f"By the logs {'; '.join(numbers)}. Was the load, the controller (a feedforward that u does not contain) or a unit "

@@ -216,10 +216,12 @@ def _law_table(laws: list[Law]) -> ResultTable:
         # a word stands without its path
         values = (law.series | law.where).items()
         where = ", ".join(value if isinstance(value, str) else f"{path} = {value:g}" for path, value in values)
-        why = law.stops["below"]
-        if why != law.stops["above"]:
+        reason = law.stops["below"]
+        if reason != law.stops["above"]:
             # the end of the sweep is named only where both ends are that
-            why = "; ".join(f"{end}: {stop}" for end, stop in law.stops.items() if stop != END_OF_SWEEP)
-        rows.append([f"{law.value} over {law.x}", where or "all points", law.theory, slope, halves, law.agrees, ends, why])
+            reason = "; ".join(f"{end}: {stop}" for end, stop in law.stops.items() if stop != END_OF_SWEEP)
+        rows.append(
+            [f"{law.value} over {law.x}", where or "all points", law.theory, slope, halves, law.agrees, ends, reason]
+        )
     columns = ["error", "where", "theory", "slope", "halves", "agrees", "range (points)", "why it ends there"]
     return ResultTable("Accuracy laws", columns, rows)

@@ -292,7 +292,7 @@ def _above(value: float, rounding: str = ROUND_CEILING) -> float:
 
 
 def _certificate_lines(side: str, proof: JsonObject, passed_over: int) -> Lines:
-    """What is promised of a side, what was tried, and whether that is what was asked for."""
+    """Say what is promised of a side, what was tried, and whether that is what was asked for."""
     if not proof["certified"]:
         return [f"{side}: no certificate: {proof['why_none']}."]
     # what is assumed is rounded down

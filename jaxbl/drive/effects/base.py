@@ -294,14 +294,14 @@ class AbstractEffect(eqx.Module):
         return [name for name, role in cls.roles().items() if role.kind == "size"]
 
     @classmethod
-    def released(cls, numbers: Numbers) -> list[str]:
-        """Names of the numbers that are held by default, and are not neutral."""
+    def list_released(cls, numbers: Numbers) -> list[str]:
+        """List the numbers that are held by default, and are not neutral."""
         return [name for name, role in cls.roles().items() if role.kind == "held" and numbers[name] != role.neutral]
 
     @classmethod
     def plainer(cls, numbers: Numbers) -> dict[str, Numbers]:
         """Plain laws of an effect with these numbers, by kind: itself with what is held by default, and special cases."""
-        neutral = {name: cls.neutral()[name] for name in cls.released(numbers)}
+        neutral = {name: cls.neutral()[name] for name in cls.list_released(numbers)}
         itself = {cls.kind: {**numbers, **neutral}} if neutral else {}
         return itself | {kind: reduced(numbers) for kind, reduced in cls.special_cases.items()}
 
