@@ -42,6 +42,17 @@ def prepare_search(log, study):
     return EffectSearch(nominal, free, prior, ReferenceLog(segments, bandwidth))
 
 
+def prepare_axis_search(axis, encoder_step, tmp_path):
+    """Prepare a search on 4 s of an axis under a position controller."""
+    time = 4e-3 * np.arange(1000)
+    rate = 1.5 * np.cos(2.0 * np.pi * 0.35 * time) + 0.8 * np.cos(2.0 * np.pi * 0.62 * time)
+    drive = Drive(4e-3, 6.0, 0.6, 3.0, 0.5, 2.0, motor_step=encoder_step)
+    run = simulate(axis, drive, np.cumsum(rate) * 4e-3, rate, np.ones(len(time), bool))
+    table = np.column_stack([time, run.command, run.readings[:, 0]])
+    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
+    return prepare_search(tmp_path / "log.csv", nominal_study(run={"sample_period": 4e-3}))
+
+
 def test_a_candidate_that_cannot_be_simulated_is_left_out(tmp_path):
     """A dead time of more samples than a model has states for."""
     simulate_multisine_log().write(tmp_path / "axis.csv")
@@ -133,13 +144,7 @@ def test_a_finer_law_that_is_no_more_than_the_plain_one_gives_way_to_it(tmp_path
 def test_friction_that_bends_and_falls_is_one_law(tmp_path):
     """Without it a drag stands for the fall."""
     axis = Axis(0.02, 0.03, 0.06, rise=1.5, fall=1.0, length=5e-3)
-    time = 4e-3 * np.arange(1000)
-    rate = 1.5 * np.cos(2.0 * np.pi * 0.35 * time) + 0.8 * np.cos(2.0 * np.pi * 0.62 * time)
-    drive = Drive(4e-3, 6.0, 0.6, 3.0, 0.5, 2.0, motor_step=1e-5)
-    run = simulate(axis, drive, np.cumsum(rate) * 4e-3, rate, np.ones(len(time), bool))
-    table = np.column_stack([time, run.command, run.readings[:, 0]])
-    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
-    numbers = prepare_search(tmp_path / "log.csv", nominal_study(run={"sample_period": 4e-3})).run().fitted.numbers
+    numbers = prepare_axis_search(axis, 1e-5, tmp_path).run().fitted.numbers
     assert list(numbers) == ["motor.presliding_friction"]
     friction = numbers["motor.presliding_friction"]
     assert friction["torque"] == pytest.approx(axis.friction, rel=0.05)
@@ -163,13 +168,7 @@ def test_waves_a_turn_are_found_wherever_they_are_and_beside_friction(tmp_path):
 
 def test_an_arms_friction_under_load_is_fitted_beside_its_weight(tmp_path):
     axis = Axis(0.02, 0.03, 0.06, length=3e-5, under_load=0.3, gravity=0.5, hangs=0.2)
-    time = 4e-3 * np.arange(1000)
-    rate = 1.5 * np.cos(2.0 * np.pi * 0.35 * time) + 0.8 * np.cos(2.0 * np.pi * 0.62 * time)
-    drive = Drive(4e-3, 6.0, 0.6, 3.0, 0.5, 2.0, motor_step=1e-4)
-    run = simulate(axis, drive, np.cumsum(rate) * 4e-3, rate, np.ones(len(time), bool))
-    table = np.column_stack([time, run.command, run.readings[:, 0]])
-    np.savetxt(tmp_path / "log.csv", table, "%.10g", ",", header="t,u,theta_e", comments="")
-    search = prepare_search(tmp_path / "log.csv", nominal_study(run={"sample_period": 4e-3}))
+    search = prepare_axis_search(axis, 1e-4, tmp_path)
     begin = {"load.gravity": {"torque": 0.4, "phase": 0.0}, "motor.coulomb_friction": {"torque": 0.03}}
     begin["transmission.load_friction"] = {"coefficient": 0.1}
     without, fitted = (search.fits.fit(numbers, np.zeros(2)) for numbers in (dict(list(begin.items())[:2]), begin))
