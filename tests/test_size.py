@@ -22,13 +22,13 @@ from size import ROOT, Size, measure_file, measure_folders
 # a plain law where something unknown is likelier (299 tokens), for which `estimation` has no second fit of torques (777);
 # and it and `drive` have friction that falls, plain laws in every model that is tried, and what laws of friction miss (800).
 CEILINGS = {
-    "all": (372857, 0.01, 0.14, 0.0),
-    "report": (43540, 0.01, 0.32, 0.0),
-    "diagnosis": (55649, 0.0, 0.0, 0.0),
-    "records": (50383, 0.0, 0.0, 0.0),
-    "gains": (36380, 0.0, 0.0, 0.0),
+    "all": (372882, 0.01, 0.14, 0.0),
+    "report": (43543, 0.01, 0.32, 0.0),
+    "diagnosis": (55655, 0.0, 0.0, 0.0),
+    "records": (50386, 0.0, 0.0, 0.0),
+    "gains": (36388, 0.0, 0.0, 0.0),
     "estimation": (29447, 0.0, 0.0, 0.0),
-    "sweeps": (28582, 0.08, 0.0, 0.0),
+    "sweeps": (28587, 0.08, 0.0, 0.0),
     "exports": (23119, 0.02, 0.0, 0.0),
     "fused": (23348, 0.0, 0.0, 0.0),
     ".": (22498, 0.0, 0.0, 0.0),

@@ -255,12 +255,12 @@ class EffectSearch:
             visited.add(state)
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
-            current, *gained = self._reduce(better or current, thorough=thorough)
+            current, gains, plainer = self._reduce(better or current, thorough=thorough)
             if better is not None:
                 self.check_model(current)
             if better is not None or self._identify(current) not in visited:
                 continue
-            explanation = self._conclude(current, *gained)
+            explanation = self._conclude(current, gains, plainer)
             rivals = explanation.rivals
             accepted = [
                 (name, trial)
@@ -464,7 +464,7 @@ class EffectSearch:
         """Put special cases of an effect in its place, up to one over which it gains nothing."""
         trials = list[Trial]()
         for law in self._plain_laws(current, name):
-            numbers = _drop_effects(current.numbers, [name]) | law
+            numbers = {**_drop_effects(current.numbers, [name]), **law}
             less = self._refit(current, numbers)
             gain = self.gain(less, current)
             self._note(describe_change(current.numbers, numbers), gain, not gain.is_accepted, gain.rule, loss=True)

@@ -195,7 +195,7 @@ class GainSearch:
         keys, error = [f"observer.{side}.lambda", f"observer.{side}.alpha"], f"{self.table.objective}_rmse"
         runs = frame[[*keys, "finite"]].assign(**{name: frame[f"{side}.{name}"] for name in ("converged", *GAIN_METRICS)})
         groups = runs.groupby(keys, sort=True)
-        worst = groups[[*GAIN_METRICS]].max().join(groups[["converged", "finite"]].all())
+        worst = pd.DataFrame(groups[[*GAIN_METRICS]].max()).join(groups[["converged", "finite"]].all())
         # chatter is a part of the error: it belongs to the run with the largest one
         worst["chatter"] = runs.sort_values(error, kind="stable").groupby(keys, sort=True)["chatter"].last()
         seeds = frame.groupby([*keys, *self.scenarios.columns])[f"{side}.{error}"].agg(["mean", "sem"])

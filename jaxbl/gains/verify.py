@@ -240,7 +240,7 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
     converged_runs = frame[converged]
     true_bound, claimed_bound = (converged_runs[column] for column in bounds.values())
     too_small = true_bound > claimed_bound
-    ratio = (true_bound / claimed_bound).replace([np.inf, -np.inf], np.nan)
+    ratio = pd.Series(true_bound / claimed_bound).replace([np.inf, -np.inf], np.nan)
     claimed = {
         "definition": "twice the largest acceleration",
         "converged_runs": len(converged_runs),

@@ -304,7 +304,7 @@ class Stream:
             self._check_period(stamps[restart:])
             return [*rows, *self._split_rows(samples[:, restart:])]
         is_later = stamps > latest
-        self._count(DISORDERED, np.count_nonzero(~is_later))
+        self._count(DISORDERED, int(np.count_nonzero(~is_later)))
         # from the last sample, which was returned already, lost ones are interpolated
         samples, returned = np.concatenate([self._last, samples[:, is_later]], axis=1), self._last.shape[1]
         self._last = samples[:, -1:]

@@ -121,5 +121,5 @@ class Groups:
             first, last = np.cumsum(count) - count, np.maximum(count - 1, 0)
             # the median lies between two ranks; a group without numbers has the nan
             ranks = (np.where(count == 0, len(pairs) - 1, first + rank) for rank in (0, last // 2, (last + 1) // 2, last))
-            least, below, above, largest = (pairs[rank].imag for rank in ranks)
+            least, below, above, largest = (np.imag(pairs[rank]) for rank in ranks)
         return DataFrame({"least": least, "median": 0.5 * (below + above), "largest": largest}, self.index)

@@ -107,7 +107,7 @@ class Points:
 
     def coarse_points(self, positions: PointIndices) -> PointIndices:
         """Indices of points of a group that are always simulated, by their positions 0 ... coarse_size - 1 among these."""
-        return positions if self.refinement is None else self.refinement.grid.coarse_indices(positions)
+        return positions if self.refinement is None else self.refinement.grid.coarse_indices(np.asarray(positions))
 
     def axis_values(self, path: str) -> np.ndarray:
         """All values of a leaf axis in their order; those of the fine grid if it is refined."""
