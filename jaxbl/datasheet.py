@@ -10,15 +10,12 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from .errors import InputError
 from .json_types import JsonObject
 from .lines import percent
 from .units import on_a_line
-
-if TYPE_CHECKING:
-    pass
 
 Unit = float | Callable[[float], float]
 """A factor to SI, or a function that gives the SI value."""
@@ -109,7 +106,7 @@ class Item(NamedTuple):
             unit = next(iter(units_by_spelling))
         if unit not in units_by_spelling:
             allowed = ", ".join(filter(None, self.units)) or "none"
-            fault = f"the unit '{match[2]}' is not allowed here; known" if unit else f"has no unit; such as {example}; units"
+            fault = f"the unit '{match[2]}' is not known here; known" if unit else f"has no unit; such as {example}; units"
             raise InputError(f"{self.option} '{text}': {fault}: {allowed}")
         name, factor = units_by_spelling[unit]
         try:

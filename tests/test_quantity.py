@@ -82,9 +82,8 @@ def test_a_table_leaves_out_columns_without_a_number():
     assert table.columns == ["path", "value", "standard error", "unit"]
     assert table.rows == [["a", 1.0, None, "rad"], ["b", 2.0, 0.1, "s"]]
     full = number_table("Numbers", {"a": Quantity(1.0, 0.1, (0.8, 1.2), "rad", 0.9)})
-    assert full.columns == ["path", "value", "standard error", "95 % from", "to", "unit", "nominal"] and full.rows == [
-        ["a", 1.0, 0.1, 0.8, 1.2, "rad", 0.9]
-    ]
+    assert full.columns == ["path", "value", "standard error", "95 % from", "to", "unit", "nominal"]
+    assert full.rows == [["a", 1.0, 0.1, 0.8, 1.2, "rad", 0.9]]
 
 
 def test_an_interval_without_an_end_has_the_value_there():

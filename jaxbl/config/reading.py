@@ -216,9 +216,12 @@ def _validate(name: str, data: JsonObject, layers: Layers) -> Config:
 
 
 def _hold(key: Sequence[str | int], table: Any) -> list[str | int]:
-    """The parts of a key that a table holds, one within the other; of pydantic's keys, not the names of unions' members."""
+    """The parts of a key that a table holds, one within the other; of pydantic's keys, not the names of unions' members,
+    which are the kind or law of a table."""
     held = []
     for part in key:
+        if isinstance(table, Mapping) and part in (table.get("kind"), table.get("law")):
+            continue
         if part in table if isinstance(table, Mapping) else isinstance(part, int):
             held.append(part)
             table = table[part]

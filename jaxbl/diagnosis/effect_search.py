@@ -314,12 +314,8 @@ class EffectSearch:
         return current
 
     def _identify(self, fitted: FittedModel) -> tuple[bool, frozenset[tuple]]:
-        """Tell models apart by what is known of the numbers, by their effects, and by the waves of these."""
-        laws = (
-            (name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].list_released(numbers))
-            for name, numbers in fitted.numbers.items()
-        )
-        return self.fits is self.rough, frozenset(laws)
+        """Tell models apart by what is known of the numbers, and by the laws of their effects."""
+        return self.fits is self.rough, frozenset(_law(name, numbers) for name, numbers in fitted.numbers.items())
 
     def _next(self, current: FittedModel) -> FittedModel | None:
         """Find the best model with more effects that is accepted."""
@@ -382,18 +378,18 @@ class EffectSearch:
         promise = proposal.nats if np.isfinite(proposal.nats) else 0.0
         as_proposed = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
         fitted = self._simplify(as_proposed)
-        left = [name for name in old if name in fitted.names or any(contains(name, plain) for plain in fitted.names)]
+        staying = [name for name in old if name in fitted.names or any(contains(name, plain) for plain in fitted.names)]
+        before = {_law(name, numbers) for name, numbers in current.numbers.items()}
         added = [
             name
-            for name, values in fitted.numbers.items()
-            if (name not in current.names or EFFECTS[name].list_released(values))
-            and not any(other == name or contains(other, name) for other in left)
+            for name, numbers in fitted.numbers.items()
+            if _law(name, numbers) not in before and not any(other == name or contains(other, name) for other in staying)
         ]
         if not added:
             return Trial(tuple(new), as_proposed, self.gain(current, as_proposed))
-        if len(left) < len(old):
+        if len(staying) < len(old):
             # what went stood for the new ones: they are compared with the model that has neither
-            current = self._refit(current, {name: old[name] for name in left})
+            current = self._refit(current, {name: old[name] for name in staying})
         return Trial(tuple(added), fitted, self.gain(current, fitted))
 
     def _refit(self, current: FittedModel, numbers: EffectNumbers, *added: str) -> FittedModel:
@@ -439,7 +435,8 @@ class EffectSearch:
                     less = self._refit(current, _drop_effects(current.numbers, [name]))
                     gains[name] = self.gain(less, current)
                     stays = certain or gains[name].is_accepted
-                    self._note(f"remove {name}", gains[name], not stays, gains[name].rule, loss=True)
+                    change = describe_change(current.numbers, less.numbers)
+                    self._note(change, gains[name], not stays, gains[name].rule, loss=True)
                     fewer = None if stays else less
                 if fewer is not None:
                     current = fewer
@@ -464,10 +461,9 @@ class EffectSearch:
         """Put special cases of an effect in its place, up to one over which it gains nothing."""
         trials = list[Trial]()
         for law in self._plain_laws(current, name):
-            numbers = {**_drop_effects(current.numbers, [name]), **law}
-            less = self._refit(current, numbers)
+            less = self._refit(current, {**_drop_effects(current.numbers, [name]), **law})
             gain = self.gain(less, current)
-            self._note(describe_change(current.numbers, numbers), gain, not gain.is_accepted, gain.rule, loss=True)
+            self._note(describe_change(current.numbers, less.numbers), gain, not gain.is_accepted, gain.rule, loss=True)
             trials.append(Trial((*law,), less, gain))
             if not gain.is_accepted:
                 break
@@ -508,11 +504,11 @@ class EffectSearch:
         trials = list[Trial]()
         for proposal in self._rank(linear, current.names, suitable, linear.best_predictor, -np.inf):
             (law,) = proposal.numbers
-            fitted = self._try(current, proposal).fitted
-            gain = self.gain(fitted, current)
-            change = f"{name} with other waves" if law == name else describe_change(current.numbers, fitted.numbers)
+            trial = self._try(current, proposal)
+            gain = self.gain(trial.fitted, current)
+            change = f"{name} with other waves" if law == name else describe_change(current.numbers, trial.fitted.numbers)
             self._note(change, gain, False, "what is better by the same rule stays", loss=True)
-            trials.append(Trial((law,), fitted, gain))
+            trials.append(trial._replace(gain=gain))
         return trials
 
     def _note(self, change: str, gain: Gain, accepted: bool, reason: str, *, loss: bool = False) -> None:
@@ -558,7 +554,7 @@ class EffectSearch:
         together = regression.propose_together()
         if len(together) > 1:
             proposals.append(_Proposal(together))
-        # no screening along a predictor's path foresees how a law with a memory changes it
+        # a screening chooses among their trial values; what they gain it does not foresee, as a memory changes the path
         laws = self._rank(linear, current.names, finer, linear.best_predictor, -np.inf)
         proposals += [law._replace(nats=np.inf) for law in laws]
         return proposals
@@ -575,8 +571,8 @@ class EffectSearch:
         self, linear: Linear, names: Sequence[str], variants: Sequence[Candidate], predictor: Predictor, least: float = 0.0
     ) -> list[_Proposal]:
         """Rank the best variants of effects by the linearised model, of those that promise at `least` so many nats."""
-        if not np.isfinite(predictor.deviation).all():
-            # no predictor follows this model
+        if not variants or not np.isfinite(predictor.deviation).all():
+            # nothing to rank, or no predictor follows this model
             return []
         alone, *models = linear.products(variants, predictor.smoothness, predictor.deviation)
         base = evidence_of(alone)
@@ -623,6 +619,11 @@ class EffectSearch:
 def _drop_effects(numbers: EffectNumbers, names: Collection[str]) -> EffectNumbers:
     """Leave out the numbers of some effects."""
     return {name: values for name, values in numbers.items() if name not in names}
+
+
+def _law(name: str, numbers: Numbers) -> tuple:
+    """Identify the law of an effect: its name, its waves, and what it does not hold."""
+    return name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].list_released(numbers)
 
 
 def _waves(name: str) -> list[str]:

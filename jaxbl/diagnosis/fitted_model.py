@@ -46,6 +46,7 @@ class FittedModel(NamedTuple):
         theta: of these.
         covariance: of theta.
         white: the same if prediction errors are white, as those of a complete model.
+        inflation: of their variances, by not knowing the other numbers; of what is wrong with a number, that of the number.
         end: where the fit ended: another one begins there.
         left_out: changes of theta where one quarter of the log after the other is left out; shape (quarters, theta).
         log_odds: of the effects before the log is seen, nats.
@@ -64,6 +65,7 @@ class FittedModel(NamedTuple):
     log_odds: float = 0.0
     log_evidence: float = -np.inf
     foretold: np.ndarray | None = None
+    inflation: np.ndarray = np.ones(0)
 
     @property
     def linear(self) -> Linear:
@@ -76,10 +78,9 @@ class FittedModel(NamedTuple):
 
     def own_share(self, name: str) -> float:
         """Torque of an effect that no other number of the model makes up for, as :meth:`share`."""
-        inflation = np.diag(self.white) * np.diag(np.linalg.inv(self.white))
         sizes = {f"effects.{name}.{leaf}" for leaf in EFFECTS[name].sizes()}
-        least = min((float(inflation[i]) for i, number in enumerate(self.free) if number.path in sizes), default=1.0)
-        return self.share(name) / least**0.5
+        inflation = [factor for number, factor in zip(self.free, self.inflation, strict=True) if number.path in sizes]
+        return self.share(name) / float(np.sqrt(min(inflation, default=1.0)))
 
     def missed_share(self, name: str) -> float:
         """Torque that laws of the other effects may miss, as :meth:`share`."""

@@ -73,7 +73,7 @@ class _Steps(NamedTuple):
         count, states = self.defect.shape
         own_width = 1 + self.by_number.shape[2]
         width = own_width + forces.width + states
-        recursion = LinearPredictor.of(states, self.readings.shape[1], width)
+        recursion = LinearPredictor(states, self.readings.shape[1], width)
         begun = np.zeros((states, width))
         begun[:, -states:] = np.eye(states)
         changes = [begun] * len(gains)

@@ -287,11 +287,12 @@ class _Fit:
         errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)
         foretold = errors[:, :, 0].copy()
         changes = np.zeros((QUARTERS, count))
-        covariance = inverse = np.zeros((0, 0))
+        covariance = inverse = precision = np.zeros((0, 0))
         if count:
             prior = np.diag(self.width**-2.0)
             spread = spread_of(errors[None, :, :, 0], slopes[None], 2 * sides)
-            inverse = np.linalg.inv(spread.information + prior)
+            precision = spread.information + prior
+            inverse = np.linalg.inv(precision)
             middle = spread.information @ spread.covariance @ spread.information + prior
             covariance, changes = inverse @ middle @ inverse, leave_quarters_out(errors[:, :, 0], slopes, prior)
             for rows, part in zip(np.array_split(np.arange(len(errors)), BLOCKS), parts_of_blocks(QUARTERS), strict=True):
@@ -299,6 +300,7 @@ class _Fit:
         return self._release(
             fitted._replace(
                 covariance=covariance, white=inverse, left_out=changes, foretold=size * foretold,
+                inflation=np.diag(precision) * np.diag(inverse),
                 log_evidence=fitted.log_odds - 0.5 * point.cost
                 + 0.5 * float(np.linalg.slogdet(inverse)[1]) - float(np.sum(np.log(self.width))),
             )
@@ -325,6 +327,7 @@ class _Fit:
             fitted = fitted._replace(
                 experiment=experiment, free=(*fitted.free, added), theta=theta, left_out=fitted.left_out @ rows.T,
                 covariance=rows @ fitted.covariance @ rows.T + shared, white=rows @ fitted.white @ rows.T + shared,
+                inflation=np.append(fitted.inflation, fitted.inflation[i]),
             )  # fmt: skip
         return fitted
 

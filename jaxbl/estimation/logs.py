@@ -186,7 +186,8 @@ def read_with_holdout(
     other = _read_held_out(config, holdout, record, seeks_delay)
     if _is_longer(other.sample_period, record.sample_period):
         config = config.with_keys("log", resample=other.sample_period)
-        return read_with_holdout(config, logs, holdout, seeks_delay=seeks_delay, share=share)
+        record = read_logs(config, logs, seeks_delay=seeks_delay, share=share)
+        other = _read_held_out(config, holdout, record, seeks_delay)
     check_positions(record, other)
     return record, other
 

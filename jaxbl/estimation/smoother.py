@@ -234,7 +234,10 @@ def smoothed_accelerations(positions: np.ndarray, period: float, noise_and_jerk:
     """Accelerations of several channels, shape (samples, channels), each smoothed as :func:`smooth` does with the same noise
     and jerk."""
     sigma, jerk = noise_and_jerk
-    smoothness, firsts = np.float64(jerk * period**5 / sigma**2), range(0, positions.shape[1], _TOGETHER)
+    smoothness, accelerations = np.float64(jerk * period**5 / sigma**2), np.empty_like(positions)
     with np.errstate(all="ignore"):
-        scaled = (positions - positions[0]) / sigma
-        return np.hstack([_passes(scaled[:, i : i + _TOGETHER], smoothness)[2] for i in firsts]) * sigma / period**2
+        for first in range(0, positions.shape[1], _TOGETHER):
+            channels = positions[:, first : first + _TOGETHER]
+            acceleration = _passes((channels - channels[0]) / sigma, smoothness)[2]
+            accelerations[:, first : first + _TOGETHER] = acceleration * sigma / period**2
+    return accelerations

@@ -83,7 +83,7 @@ def _shape(array: Any) -> jax.ShapeDtypeStruct:
 
 
 _make_shape = functools.lru_cache(jax.ShapeDtypeStruct)
-"""Each is made once, which takes longer than to find it."""
+"""Kept, as making one takes longer than to look it up."""
 
 
 def _is_shape(leaf: Any) -> bool:

@@ -14,13 +14,11 @@ import numpy as np
 from jaxbl.workers import map_in_threads
 
 from . import Arrays, Leaves
-from .signal_scan import advance_signal
+from .signal_scan import compile_signal_loop
 
 _NEGLIGIBLE = 1e-60
 """Size below which a change counts as zero: it is added and taken away again, so that what decays becomes 0. Processors take
 many times as long for numbers below 1e-308, which squares are from 1e-154 on."""
-_VECTOR = 16
-"""Columns are filled up to a multiple of this, which fills the vectors of every processor."""
 
 
 class LinearPredictor(NamedTuple):
@@ -29,11 +27,6 @@ class LinearPredictor(NamedTuple):
     states: int
     sides: int
     width: int
-
-    @classmethod
-    def of(cls, states: int, sides: int, width: int) -> "LinearPredictor":
-        """The predictor of these sizes."""
-        return cls(states, sides, width)
 
     def __call__(
         self,
@@ -55,18 +48,21 @@ class LinearPredictor(NamedTuple):
         Returns:
             For each gain, d after the last sample, and the errors e, shape (sides, samples, columns).
         """
-        count, width = len(transition), -(-self.width // _VECTOR) * _VECTOR
+        states, sides, count = self.states, self.sides, len(transition)
+        loop = compile_signal_loop(_predict_sample, 2 * sides, states, states**2, states + sides, self.width == 1)
+        # filled here, once for all gains
+        width = loop.whole_vectors(self.width)
         padding = (0, width - self.width)
-        lane_inputs = np.zeros((self.states + self.sides, count, width))
-        lane_inputs[: self.states, :, : self.width] = forcing
-        lane_inputs[self.states :, :, 0] = readings.T
-        shared_inputs = transition.reshape(count, -1).T
+        lane_inputs = np.zeros((states + sides, count, width))
+        lane_inputs[:states, :, : self.width] = forcing
+        lane_inputs[states:, :, 0] = readings.T
+        inputs = {"sample_inputs": np.ascontiguousarray(transition.reshape(count, -1).T), "lane_inputs": lane_inputs}
 
         def predict(change: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # positions first, then velocities
             values = np.repeat(np.transpose(gain).reshape(-1, 1), width, axis=1)
             carry = np.pad(change, ((0, 0), padding))
-            carry, errors = advance_signal(_predict_sample, values, carry, shared_inputs, lane_inputs)
+            carry, errors, _ = loop.run(count, width, values=values, carry=carry, **inputs)
             return np.asarray(carry)[:, : self.width], np.asarray(errors)[:, :, : self.width]
 
         predictions = [predict(changes[0], gains[0])] if len(gains) == 1 else map_in_threads(predict, changes, gains)

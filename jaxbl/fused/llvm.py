@@ -170,7 +170,7 @@ class Loop:
         if "outputs" not in inputs:
             groups["outputs"] = allocate(self.signature["outputs"], (steps, width))
         for name, arrays in inputs.items():
-            if any(padding) and len(arrays) and "lanes" in EXTENTS[name]:
+            if any(padding) and len(arrays) and "lanes" in EXTENTS.get(name, ""):
                 stack = np.asarray(arrays)
                 arrays = np.pad(stack, [*[(0, 0)] * (stack.ndim - 1), padding], "edge")
             groups[name] = [*map(np.array, arrays)] if name == "carry" else arrays

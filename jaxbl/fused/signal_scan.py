@@ -1,11 +1,10 @@
 """Scan a function of a sample's scalars along a signal, by a loop for this machine's processor: one loop for all lengths."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from . import ArrayGroup, Arrays, Leaves
+from . import Arrays, Leaves
 from .compiled_loop import NUMBER, LoopDefinition, compile_once
 
 SampleFunction = Callable[[Leaves, Leaves, Leaves], tuple[Leaves, Leaves]]
@@ -26,33 +25,20 @@ def scan_signal(
     Returns:
         The outputs of the function, each of shape (samples, lanes).
     """
-    columns = [column[:, 0] if len(carry[0]) == 1 and column.ndim == 2 else column for column in map(np.asarray, inputs)]
-    groups = (columns, ()) if columns[0].ndim == 1 else ((), columns)
-    return [*advance_signal(sample, values, carry, *groups)[1]]
-
-
-def advance_signal(
-    sample: SampleFunction, values: Any, carry: Any, shared_inputs: Any, lane_inputs: Any
-) -> tuple[ArrayGroup, ArrayGroup]:
-    """The same with inputs of both kinds: those of each sample, `(samples,)`, come before those of each sample and lane,
-    `(samples, lanes)`. All may be lists of arrays, or rows of one array.
-
-    Returns:
-        The carry after the last sample, and the outputs.
-    """
-    groups = [np.asarray(group, float) for group in (values, carry, shared_inputs, lane_inputs)]
-    lanes, samples = groups[1].shape[1], (groups[2] if len(shared_inputs) else groups[3]).shape[1]
-    loop = _compile_loop(sample, *map(len, groups), lanes == 1)
+    lanes = len(carry[0])
+    columns = [column[:, 0] if lanes == 1 and column.ndim == 2 else column for column in map(np.asarray, inputs)]
+    by_kind = (columns, ()) if columns[0].ndim == 1 else ((), columns)
+    groups = [np.ascontiguousarray(group, float) for group in (values, carry, *by_kind)]
+    loop = compile_signal_loop(sample, *map(len, groups), lanes == 1)
     names = "values", "carry", "sample_inputs", "lane_inputs"
-    carry, outputs, _ = loop.run(samples, lanes, **dict(zip(names, map(np.ascontiguousarray, groups), strict=True)))
-    return carry, outputs
+    return [*loop.run(len(columns[0]), lanes, **dict(zip(names, groups, strict=True)))[1]]
 
 
 @compile_once
-def _compile_loop(
+def compile_signal_loop(
     sample: SampleFunction, values: int, carry: int, shared_inputs: int, lane_inputs: int, has_single_lane: bool
 ) -> LoopDefinition:
-    """The loop for these numbers of arguments."""
+    """The loop for these numbers of arguments: inputs of each sample come before those of each sample and lane."""
 
     def advance(values: Leaves, carry: Leaves, shared_inputs: Leaves, lane_inputs: Leaves) -> tuple[Leaves, Leaves]:
         return sample(values, carry, [*shared_inputs, *lane_inputs])

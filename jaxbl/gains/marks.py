@@ -31,16 +31,17 @@ def judge_marks(ideal: Config, stages: Stages) -> list[JsonObject]:
     judged, config = [], stages.config
     base = ideal.to_dict() | {"axes": [], "sweep": {}}
     drive = config.build().drive
+    # the observer does not act on the drive: one run has the disturbance of all gains
+    trace = run(read_config(base)).trace if config.verify.marks else None
     for side in config.sides:
         marks = [mark for mark in config.verify.marks if mark.side == side]
-        if not marks:
+        if trace is None or not marks:
             continue
         pairs = [(mark.lambda_, mark.alpha) for mark in marks]
         gains = pd.DataFrame(pairs, columns=[f"observer.{side}.{gain}" for gain in ("lambda", "alpha")])
         axes = list_axes({"marks": gains.drop_duplicates().to_dict("list")})
         runs = gains.merge(stages.rerun(base | {"axes": axes}, "marks", side), how="left").to_dict("records")
-        # the observer does not act on the drive: one run has the disturbance of all gains
-        disturbance = read_disturbance(drive, side, run(read_config(base)).trace)
+        disturbance = read_disturbance(drive, side, trace)
         starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
         error, friction = abs(starts[1]), disturbance.damping
         for mark, pair, metrics in zip(marks, pairs, runs, strict=True):

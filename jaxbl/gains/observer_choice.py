@@ -346,8 +346,7 @@ def _describe_search(side: SideSearch, name: str) -> JsonObject:
     return {
         "gains": {path.removeprefix(f"observer.{name}."): value for path, value in side.best.items()},
         "error_in_search": side.error,
-        # NaN without a zoom
-        "gained_by_last_zoom": side.error_before and (side.error_before - side.error) / side.error_before,
+        "gained_by_last_zoom": 1.0 - side.error / side.error_before if 0.0 < side.error_before < math.inf else None,
         "at_range_end": [path.removeprefix(f"observer.{name}.") for path in side.gains_at_ends()],
     }
 
@@ -381,8 +380,9 @@ def _remarks(search: _KindSearch, points: Sequence[Mapping[str, Any]]) -> list[s
         ends = Counter((kind, key) for kind, rank in ranks for key in rank["at_range_end"])
         unfinished: dict[str, list[float]] = {}
         for kind, rank in ranks:
-            if rank["gained_by_last_zoom"] > _UNFINISHED_SHARE:
-                unfinished.setdefault(kind, []).append(rank["gained_by_last_zoom"])
+            gained = rank["gained_by_last_zoom"]
+            if gained is not None and gained > _UNFINISHED_SHARE:
+                unfinished.setdefault(kind, []).append(gained)
         share = f"of {len(points)} points" if len(points) > 1 else ""
         if ends:
             gains = ", ".join(f"{kind}.{key}{f' ({n} {share})' if share else ''}" for (kind, key), n in ends.items())

@@ -79,9 +79,11 @@ def excursion(alpha: float, disturbance: Disturbance) -> float:
     times, values, damping = disturbance
     steps = np.diff(times)
     effective_steps = steps if damping == 0.0 else -np.expm1(-damping * steps) / damping
-    columns = np.exp(-damping * steps), effective_steps, values[:-1], values[1:]
+    columns = np.stack([np.exp(-damping * steps), effective_steps, values[:-1], values[1:]])
+    # no pulse begins before the first sample above alpha
+    begin = max(int(np.argmax(np.append(np.abs(values) > alpha, True))) - 1, 0)
     largest, speed, sign = 0.0, 0.0, 1.0
-    for remaining_share, step, before, after in zip(*(column.tolist() for column in columns), strict=True):
+    for remaining_share, step, before, after in columns[:, begin:].T.tolist():
         if speed == 0.0:
             # that of the pulse that may begin here
             sign = math.copysign(1.0, after if abs(after) > alpha else before)

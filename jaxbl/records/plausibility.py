@@ -193,6 +193,19 @@ def _check_twist_range(file: LogFile, unit: str, gearing: Gearing, expected: flo
     )
 
 
+def _shows_inertia(rigid_fit: RigidFit, standard_errors: float) -> bool:
+    """Return True if the torque clearly shows an inertia beyond so many standard errors; a negative one, if these are."""
+    is_clear = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
+    inertia = math.copysign(1.0, standard_errors) * rigid_fit.values[0]
+    return bool(is_clear and inertia > abs(standard_errors) * rigid_fit.errors[0])
+
+
+def _accelerates_with_torque(rigid_fit: RigidFit) -> bool:
+    """Return True if the sign of the torque is right, whatever else is odd: a lag turns the torque of an inertia against the
+    speed; a wrong sign turns it against the acceleration, too."""
+    return _shows_inertia(rigid_fit, 3.0)
+
+
 _MAX_RETURNED_WORK = -0.5
 """Share of the exchanged work, below which more comes back than any model of a drive can return."""
 
@@ -208,11 +221,8 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     torque = np.concatenate([grid.values["u"][segment][:-1] for segment in grid.segments])
     exchanged = np.abs(torque) @ np.abs(steps)
     work_share = torque @ steps / exchanged if exchanged else 0.0
-    has_clear_inertia = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
-    # 8 standard errors prove the wrong sign, 3 are enough for the right one
-    inertia, error = rigid_fit.values[0], rigid_fit.errors[0]
-    accelerates_against_torque = has_clear_inertia and -inertia > 8.0 * error
-    accelerates_with_torque = has_clear_inertia and inertia > 3.0 * error
+    # 8 standard errors prove the wrong sign
+    accelerates_against_torque = _shows_inertia(rigid_fit, -8.0)
     if displacement > 0.2 * np.abs(steps).sum():
         # potential energy may pay for the motion
         work_share = max(work_share, 0.0)
@@ -226,8 +236,7 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     if work_share < -0.1:
         returned_text = f"the drive returns {-100 * work_share:.0f} % of the work"
         file.warnings.append(f"{DOUBT}{returned_text}: the load drives it, or u has the wrong sign or acts late.")
-        # a lag may do it: see `flag_wrong_units`
-        if work_share < _MAX_RETURNED_WORK and not accelerates_with_torque:
+        if work_share < _MAX_RETURNED_WORK and not _accelerates_with_torque(rigid_fit):
             file.contradiction = (
                 f"{returned_text}, as only a drive with a driving load does: set sign = -1 in [log] u, or take a log in "
                 "which the motor drives"
@@ -303,9 +312,8 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         file.warnings.append(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
     same_direction = has_odd_friction and (power_ratio > 1.0) == (ratio > 1.0)
-    # friction that falls with the speed takes work none the less; a lag turns the torque of an inertia against the speed, a
-    # wrong sign against the acceleration, too
-    is_reversed = friction_power < 0.0 and shows_viscous and not inertia > 3.0 * rigid_fit.errors[0]
+    # friction that falls with the speed takes work none the less
+    is_reversed = friction_power < 0.0 and shows_viscous and not _accelerates_with_torque(rigid_fit)
     if is_reversed and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0:
         file.contradiction = (
             f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "

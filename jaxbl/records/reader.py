@@ -244,7 +244,7 @@ def _resample_and_align(
     Returns:
         The samples, the relation of both encoders, True if the stamps had that spacing already, and the lateness of u.
     """
-    period = table.resample or segmented.period
+    channels, period = {**channels}, table.resample or segmented.period
     regular = segmented.sampling.even and math.isclose(period, segmented.period, rel_tol=1e-9)
 
     def resample() -> tuple[Grid, Gearing | None]:

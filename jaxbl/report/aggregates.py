@@ -108,7 +108,8 @@ class Groups:
         return DataFrame(sums.T, self.index, [*columns]).div(counts.T).assign(rows=counts[-1].astype(int))
 
     def spread(self, column: Column) -> DataFrame:
-        """The `least`, `median` and `largest` of a column's numbers by group, NaN left out; NaN where a group has none."""
+        """The `least`, `median` and `largest` of a column's numbers by group, NaN left out; NaN where a group has none.
+        They are sorted in a temporary file of 16 bytes a number."""
         count = np.zeros(len(self), np.int64)
         with TemporaryFile() as file:
             for groups, values in self._numbers(column):

@@ -141,6 +141,18 @@ def test_a_finer_law_that_is_no_more_than_the_plain_one_gives_way_to_it(tmp_path
     assert trial.gain.is_accepted
 
 
+def test_a_number_that_is_off_is_sure_beside_friction(tmp_path):
+    """What it is off by and the number itself stand for one another, and that makes it no less sure."""
+    hidden = [{"kind": "motor.coulomb_friction", "torque": 0.1}, {"kind": "motor.viscous_friction", "viscous": 0.03}]
+    simulate_direct_drive(simulate_multisine_log().u[:1000], hidden, 3e-5, 1).write(tmp_path / "log.csv")
+    explanation = prepare_search(tmp_path / "log.csv", nominal_study()).run()
+    # what a law of friction misses is a quarter of its own torque
+    assert {finding.effect: finding.confidence > 0.9 for finding in weigh(explanation)} == {
+        "motor.coulomb_friction": True,
+        "motor.viscous_friction": True,
+    }
+
+
 def test_friction_that_bends_and_falls_is_one_law(tmp_path):
     """Without it a drag stands for the fall."""
     axis = Axis(0.02, 0.03, 0.06, rise=1.5, fall=1.0, length=5e-3)

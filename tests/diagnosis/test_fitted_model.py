@@ -14,7 +14,7 @@ FRICTION, DRAG, WAVE = "motor.presliding_friction", "motor.quadratic_drag", "mot
 
 @pytest.fixture
 def fitted():
-    """Friction, and a drag that is all but a viscous friction: correlated by 0.99."""
+    """Friction, and a drag that is all but a viscous friction."""
     shares = {FRICTION: 0.5, DRAG: 0.1, WAVE: 0.02}
     effects = (
         make_effect(FRICTION, torque=0.1, length=0.1),
@@ -26,13 +26,13 @@ def fitted():
     return FittedModel(
         names=(FRICTION, DRAG, WAVE), experiment=any_model(effects=effects),
         free=tuple(any_model(path=path) for path in paths), theta=np.zeros(3), covariance=np.eye(3),
-        white=np.linalg.inv([[1.0, 0.99, 0.0], [0.99, 1.0, 0.0], [0.0, 0.0, 4.0]]),
+        white=np.eye(3), inflation=np.array([50.0, 50.0, 1.0]),
         end=any_model(linear=any_model(torque_share=lambda effect: shares[effect.name])),
     )  # fmt: skip
 
 
 def test_what_another_number_makes_up_for_is_not_an_effects_own_torque(fitted):
-    assert fitted.own_share(DRAG) == pytest.approx(0.1 * np.sqrt(1.0 - 0.99**2))
+    assert fitted.own_share(DRAG) == pytest.approx(0.1 / np.sqrt(50.0))
     assert fitted.own_share(WAVE) == pytest.approx(0.02)
 
 

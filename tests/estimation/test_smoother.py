@@ -125,12 +125,12 @@ def test_quantised_readings():
 @pytest.mark.parametrize(("columns", "machine_code"), [(1, True), (3, True), (21, True), (3, False)])
 def test_channels_side_by_side_are_those_one_by_one(columns, machine_code, monkeypatch):
     if not machine_code:
-        define = inspect.unwrap(signal_scan._compile_loop)
+        define = inspect.unwrap(signal_scan.compile_signal_loop)
 
         def scanned_loop(*sizes):
             return ScannedLoop(*define(*sizes)[:2])
 
-        monkeypatch.setattr(signal_scan, "_compile_loop", scanned_loop)
+        monkeypatch.setattr(signal_scan, "compile_signal_loop", scanned_loop)
     readings = np.stack([(1.0 + seed) * simulate_motion(seed, 300)[1] for seed in range(columns)], axis=1)
     result = smoothed_accelerations(readings, PERIOD, (NOISE, JERK))
     for channel, position in zip(result.T, readings.T, strict=True):

@@ -5,7 +5,7 @@ import inspect
 import numpy as np
 import pytest
 
-from jaxbl.fused import signal_scan
+from jaxbl.fused import linear_predictor, signal_scan
 from jaxbl.fused.compiled_loop import ScannedLoop
 from jaxbl.fused.linear_predictor import LinearPredictor
 
@@ -19,12 +19,12 @@ def test_errors_follow_the_definition(states, sides, width, machine_code, monkey
     start, gains = rng.normal(size=(states, width)), [rng.normal(0.3, 0.1, (sides, 2)) for _ in range(3)]
     recursion = LinearPredictor(states, sides, width)
     if not machine_code:
-        define = inspect.unwrap(signal_scan._compile_loop)
+        define = inspect.unwrap(signal_scan.compile_signal_loop)
 
         def scanned_loop(*sizes):
             return ScannedLoop(*define(*sizes)[:2])
 
-        monkeypatch.setattr(signal_scan, "_compile_loop", scanned_loop)
+        monkeypatch.setattr(linear_predictor, "compile_signal_loop", scanned_loop)
     # in two parts
     ends, first = recursion([start] * 3, gains, step[:25], inputs[:, :25], readings[:25])
     ends, last = recursion(ends, gains, step[25:], inputs[:, 25:], readings[25:])
@@ -43,12 +43,12 @@ def test_errors_follow_the_definition(states, sides, width, machine_code, monkey
 
 
 def test_one_loop_serves_all_widths():
-    before = signal_scan._compile_loop.cache_info().misses
+    before = signal_scan.compile_signal_loop.cache_info().misses
     for width in (3, 17, 90):
         LinearPredictor(3, 1, width)(
             [np.zeros((3, width))], [np.zeros((1, 2))], np.zeros((5, 3, 3)), np.zeros((3, 5, width)), np.zeros((5, 1))
         )
-    assert signal_scan._compile_loop.cache_info().misses <= before + 1
+    assert signal_scan.compile_signal_loop.cache_info().misses <= before + 1
 
 
 def test_what_has_decayed_is_zero():

@@ -92,7 +92,7 @@ class Role(NamedTuple):
     Attributes:
         kind: `size`: the torque is proportional to the number. `angle`: a phase, rad. `harmonic`: a number of periods a
             turn, which is chosen among trial values and not fitted. `frequency`: Hz. `shape`: any other positive number.
-            `held`: neutral, unless a finer law with one of its trial values is likelier.
+            `held`: stays neutral, unless it has trial values and a diagnosis finds the law with one of them likelier.
         neutral: the number with which the effect does nothing.
         trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.

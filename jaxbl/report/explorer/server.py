@@ -128,14 +128,18 @@ class ExplorerServer(ThreadingHTTPServer):
             return False
         with self._lock:
             again = version in self._loaded
-            self._loaded.add(version)
+            self._loaded |= {version} & self._list_versions()
             return again and (self._stale or version != str(self._versions))
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
+        files = (self._place / version).glob("*") if version in self._list_versions() else ()
         # names are compared, so that none leads elsewhere
-        files = (file for file in self._place.glob("*/*") if file.is_file())
-        return next((file for file in files if file.parts[-2:] == (version, name)), None)
+        return next((file for file in files if file.name == name and file.is_file()), None)
+
+    def _list_versions(self) -> set[str]:
+        """Numbers of the versions that were written, as text."""
+        return {*map(str, range(1, self._versions + 1))}
 
 
 class _Handler(BaseHTTPRequestHandler):
