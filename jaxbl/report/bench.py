@@ -96,13 +96,6 @@ def throughput_lines(result: BenchResult) -> Lines:
         size = f"{study['lanes']} lanes of {study['steps']} samples, {study['precision']}"
         lines += ["", f"A small study from nothing, {size}:"]
         lines += _align([(f"  {row['name']}", f"{row['seconds']:.2f} s") for row in result.study])
-    if result.studies:
-        lines += ["", "Studies as they stand, float64, every metric, all cores; lane-steps/s:"]
-    lines += [
-        f"  {row['name']}, {row['seeds']} seeds of {row['lanes']} lanes: jaxbl {row['jaxbl']:.3g}, C++ {row['c++']:.3g}, "
-        f"{row['jaxbl'] / row['c++']:.2g} of it"
-        for row in result.studies
-    ]
     lines += [f"{name}: left out, {reason}" for name, reason in result.left_out.items()]
     return lines + result.failures
 

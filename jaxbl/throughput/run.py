@@ -23,11 +23,9 @@ from jaxbl.workers import Progress, count_cores, make_stage_counter
 
 from .jaxbl_chain import FusedChain, ScanChain
 from .rivals.cpp_chain import CppChain, NoCompiler, compile_library, find_compiler
-from .rivals.cpp_studies import CppStudy
 from .rivals.diffrax_chain import DiffraxChain
 from .rivals.numba_chain import NumbaChain, compile_block_loop
 from .rivals.numpy_chain import NumpyChain
-from .studies import STUDIES, FusedStudy, prepare_study
 from .workload import Metrics, Workload
 
 Runner = Callable[[], Metrics]
@@ -40,8 +38,6 @@ _TOLERANCE: dict[str, dict[str, float]] = {
     "float64": {},
     # rounding decides some signs of a switching term; an error of one sample follows
     "float32": {"velocity_rmse": 1e-3, "stiffness": 0.02, "dead_zone": 0.05},
-    # a short run determines the law's parameters badly
-    "study": dict.fromkeys(("stiffness_error", "dead_zone_error", "excitation"), 1e-5),
 }
 """Largest median deviation of a figure from the reference, relative, if that is not 1e-8."""
 
@@ -119,17 +115,14 @@ class BenchResult:
         rows: of every entry and precision.
         curve: lane-steps per second over the number of lanes: {"name", "precision", "lanes", "lane_steps_per_second"}.
         study: seconds of a whole small study from nothing: {"name", "precision", "lanes", "steps", "seconds"}.
-        studies: lane-steps per second of studies as they stand: {"name", "lanes", "seeds", "steps", "deviation", "jaxbl",
-            "c++"}.
         left_out: entries that this machine cannot run, and what they need.
-        failures: a sentence for each entry or study whose results are wrong; its time is not taken.
+        failures: a sentence for each entry whose results are wrong; its time is not taken.
     """
 
     machine: JsonObject
     rows: list[BenchRow]
     curve: list[JsonObject]
     study: list[JsonObject]
-    studies: list[JsonObject]
     left_out: dict[str, str]
     failures: list[str] = field(default_factory=list)
 
@@ -164,8 +157,7 @@ def _measure(folder: Path, threads: int, quick: bool, progress: Progress | None)
     steps, rounds = (1500, 3) if quick else (4000, 7)
     jobs = [(entry, precision) for precision in PRECISIONS for entry in runnable if _is_timed(entry, precision, quick)]
     curve_lanes = [2**k for k in (range(6, 19, 3) if quick else range(6, 21))]
-    compared = STUDIES if any(entry.name == CPP_NAME for entry in runnable) else ()
-    tick = make_stage_counter((1 + rounds) * len(jobs) + len(curve_lanes) + 1 + len(compared), progress)
+    tick = make_stage_counter((1 + rounds) * len(jobs) + len(curve_lanes) + 1, progress)
     runners: list[Runner] = []
     untimed_rows: list[Callable[..., BenchRow]] = []
     failures: list[str] = []
@@ -202,14 +194,7 @@ def _measure(folder: Path, threads: int, quick: bool, progress: Progress | None)
         tick()
     small_study = _time_small_study(threads, devices, {entry.name for entry in right_entries}, 1000)
     tick()
-    studies = []
-    for name in compared:
-        try:
-            studies.append(compare_study(name, folder, threads, 6000 if quick else 10_000, rounds))
-        except NoResult as error:
-            failures.append(str(error))
-        tick()
-    return BenchResult(_describe_machine(threads), rows, curve, small_study, studies, left_out, failures)
+    return BenchResult(_describe_machine(threads), rows, curve, small_study, left_out, failures)
 
 
 def _is_timed(entry: Entry, precision: str, quick: bool) -> bool:
@@ -254,8 +239,16 @@ def _reference_metrics(lanes: int, steps: int) -> Metrics:
 
 
 def _check_entry(entry: Entry, precision: str, metrics: Metrics, reference: Metrics) -> float:
-    sampled = {name: np.asarray(values)[_spread_lanes(len(values))] for name, values in metrics.items()}
-    return check_run_metrics(f"{entry.name}, {precision}", sampled, reference, precision)
+    """Return the largest relative median deviation of a figure from the reference. Raises `NoResult` if it is too large."""
+    deviations = {}
+    for metric, expected in reference.items():
+        values = np.asarray(metrics[metric], float)
+        deviations[metric] = float(np.median(np.abs(values[_spread_lanes(len(values))] / expected - 1.0)))
+        if not deviations[metric] <= _TOLERANCE[precision].get(metric.partition(".")[2], 1e-8):
+            raise NoResult(
+                f"{entry.name}, {precision}: {metric} is off by {deviations[metric]:.2g} of it; wrong results are not timed"
+            )
+    return max(deviations.values())
 
 
 def _measure_curve(entries: Sequence[Entry], lanes: int, steps: int, precisions: Sequence[str]) -> list[JsonObject]:
@@ -294,91 +287,6 @@ def _time_small_study(threads: int, devices: int, names: set[str], lanes: int) -
             row = {"name": entry.name, "precision": workload.precision, "lanes": lanes, "steps": workload.steps}
             rows.append(row | {"seconds": seconds})
     return rows
-
-
-def compare_study(name: str, folder: Path, threads: int, steps: int, rounds: int, lanes: int | None = None) -> JsonObject:
-    """A study as it stands by this package and in C++, after a look at whether both give the same figures.
-
-    Args:
-        name: of the study.
-        folder: for the compiled kernel.
-        threads: threads.
-        steps: samples of a run.
-        rounds: that are timed, in turns.
-        lanes: left out, all of the study's.
-
-    Raises:
-        NoResult: they do not.
-    """
-    # a noisy observer amplifies rounding: number by number the figures are the same only over a short run
-    short_study = prepare_study(name, _SHORT_STEPS, lanes, identifier_start=0.1)
-    deviation = check_run_metrics(
-        name, FusedStudy(short_study)(), CppStudy(short_study, threads, folder, makes_noise=False)()
-    )
-    full_study = prepare_study(name, steps, lanes)
-    runners = [FusedStudy(full_study), *(CppStudy(full_study, threads, folder, vectors) for vectors in _VECTOR_COUNTS)]
-    check_medians(name, *(runner() for runner in runners[:2]))
-    best = [*map(min, _time_in_turns(runners, rounds))]
-    row = {"name": name, "lanes": full_study.lanes, "seeds": full_study.seeds, "steps": steps, "deviation": deviation}
-    lane_steps = full_study.lanes * full_study.seeds * steps
-    return row | {"jaxbl": lane_steps / best[0], "c++": lane_steps / min(best[1:])}
-
-
-_SHORT_STEPS = 400
-"""Samples of the run by which the figures of a study are compared number by number."""
-_NAN_SHARE = 1e-3
-"""Largest share of runs (1) in which a figure is NaN in only one implementation. At the border of convergence rounding
-decides whether a run has a convergence time; it does for 3e-4 of the runs of gain_map."""
-_VECTOR_COUNTS = 1, 2, 4
-"""That the kernel of a study takes at a time: the fastest counts."""
-
-
-def check_run_metrics(name: str, metrics: Metrics, reference: Metrics, tolerance: str = "study") -> float:
-    """Compare the figures of an entry or study with those of the reference, run by run.
-
-    A run in which both are NaN counts as equal. Runs in which only one is NaN are counted, and left out of the median.
-
-    Args:
-        name: of the entry or study.
-        metrics: by figure, an array with a number for each run.
-        reference: the same by the other implementation.
-        tolerance: precision of an entry, or "study".
-
-    Returns:
-        The largest median deviation of a figure, relative.
-
-    Raises:
-        NoResult: a median, or the share of runs in which only one number is NaN, is too large.
-    """
-    largest = 0.0
-    for metric, column in reference.items():
-        values, expected = np.asarray(metrics[metric], float), np.asarray(column, float)
-        only_one_nan = np.isnan(values) != np.isnan(expected)
-        nan_share = float(np.mean(only_one_nan))
-        if nan_share > _NAN_SHARE:
-            raise NoResult(
-                f"{name}: {metric} is NaN in only one implementation in {nan_share:.2g} of the runs, "
-                f"more than {_NAN_SHARE:g}; wrong results are not timed"
-            )
-        deviations = np.abs(values - expected) / np.maximum(np.abs(expected), np.finfo(float).tiny)
-        median = float(np.median(np.where(np.isnan(expected), 0.0, deviations)[~only_one_nan]))
-        if not median <= _TOLERANCE[tolerance].get(metric.partition(".")[2], 1e-8):
-            raise NoResult(f"{name}: {metric} is off by {median:.2g} of it; wrong results are not timed")
-        largest = max(largest, median)
-    return largest
-
-
-def check_medians(name: str, metrics: Metrics, reference: Metrics) -> None:
-    """Raises `NoResult` where the median of a figure over all runs is not that of the reference; errors of identified
-    parameters, which are about zero, do not count."""
-    for metric, expected in reference.items():
-        if metric.endswith("_error"):
-            continue
-        median, expected_median = (float(np.nanmedian(np.asarray(values, float))) for values in (metrics[metric], expected))
-        if not abs(median - expected_median) <= 0.05 * abs(expected_median):
-            raise NoResult(
-                f"{name}: {metric} has a median of {median:.3g}, not {expected_median:.3g}; wrong results are not timed"
-            )
 
 
 def _describe_machine(threads: int) -> JsonObject:

@@ -24,6 +24,7 @@ _COMPILER_FLAGS = (
     "-fPIC",
 )
 """Fused multiply-add as the compiler likes (GCC's default), but no reordering: sums are compensated."""
+_KERNEL = Path(__file__).with_name("chain.cpp")
 SUMS = 9
 """Results of a lane, as chain.cpp numbers them."""
 
@@ -42,16 +43,17 @@ class NoCompiler(Exception):
 
 
 @cache
-def compile_library(folder: Path, name: str = "chain") -> ctypes.CDLL:
-    """A kernel for this machine, compiled into a folder. Raises `NoCompiler`."""
+def compile_library(folder: Path, source: Path = _KERNEL) -> ctypes.CDLL:
+    """Compile a kernel for this machine into a folder. Raises `NoCompiler`."""
     command = find_compiler()
     if command is None:
         raise NoCompiler("no C++ compiler; install g++, or name one in CXX")
-    source, target = Path(__file__).with_name(f"{name}.cpp"), folder.resolve() / f"{name}.so"
+    target = folder.resolve() / f"{source.stem}.so"
     folder.mkdir(parents=True, exist_ok=True)
     # anew each time: what lies there may be another machine's
     draft = target.with_suffix(f".{os.getpid()}")
-    process = subprocess.run([command, *_COMPILER_FLAGS, "-o", str(draft), str(source)], capture_output=True, text=True)
+    arguments = [*_COMPILER_FLAGS, f"-I{Path(__file__).parent}", "-o", str(draft), str(source)]
+    process = subprocess.run([command, *arguments], capture_output=True, text=True)
     if process.returncode:
         messages = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
         raise NoCompiler(f"{command} cannot compile {source.name}: {messages[-1]}")

@@ -1,12 +1,11 @@
-"""C++ gives the same figures of the studies of the benchmark."""
+"""C++ gives the same figures of the package's studies."""
 
 import numpy as np
 import pytest
+from studies_in_cpp import _NAN_SHARE, STUDIES, check_medians, check_run_metrics, compare_study
 
 from jaxbl.errors import NoResult
 from jaxbl.throughput.rivals.cpp_chain import find_compiler
-from jaxbl.throughput.run import _NAN_SHARE, check_medians, check_run_metrics, compare_study
-from jaxbl.throughput.studies import STUDIES
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
