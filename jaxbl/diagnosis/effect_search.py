@@ -490,7 +490,7 @@ class EffectSearch:
     def _try_laws(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit a model with the likeliest other waves of an effect, if it has any, as a fit leaves whole numbers as they are,
         and with finer laws of a memory in its place: no screening along a predictor's path foresees how they change it."""
-        waves = {leaf: current.numbers[name][leaf] for leaf in _waves(name)}
+        waves = {leaf: current.numbers[name][leaf] for leaf in EFFECTS[name].roles("harmonic")}
         with_memory = [law for law in self.lacking if EFFECTS[law].advance is not AbstractEffect.advance]
         laws = [law for law in with_memory if law != name and is_finer_law(law) and replaces(law, name)]
         if not (waves or laws):
@@ -623,12 +623,7 @@ def _drop_effects(numbers: EffectNumbers, names: Collection[str]) -> EffectNumbe
 
 def _law(name: str, numbers: Numbers) -> tuple:
     """Identify the law of an effect: its name, its waves, and what it does not hold."""
-    return name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].list_released(numbers)
-
-
-def _waves(name: str) -> list[str]:
-    """List the numbers of an effect that are whole, which a fit leaves as they are."""
-    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind == "harmonic"]
+    return name, *(numbers[leaf] for leaf in EFFECTS[name].roles("harmonic")), *EFFECTS[name].list_released(numbers)
 
 
 def _without(columns: Products, linear: Linear, names: Collection[str]) -> Products:

@@ -304,14 +304,18 @@ class Linear:
 
     def scales(self, name: str) -> Scales:
         """Measure how large things are on the record, as an effect sees them; frequencies and waves only if it has some."""
-        place = self.experiment.drive.resolve_place(name.partition(".")[0])
-        scales, kinds = self._scales_at(place), {role.kind for role in EFFECTS[name].roles().values()}
-        if "frequency" in kinds and not scales.frequencies:
+        place, roles = self._place_of(name), EFFECTS[name].roles
+        scales = self._scales_at(place)
+        if roles("frequency") and not scales.frequencies:
             scales = scales._replace(frequencies=tuple(self.frequencies(place)))
-        if "harmonic" in kinds and place in self.sides and not scales.waves:
+        if roles("harmonic") and place in self.sides and not scales.waves:
             scales = scales._replace(waves=tuple(self.waves(place)))
         self._scales[place] = scales
         return scales
+
+    def _place_of(self, name: str) -> str:
+        """Return where an effect of a full name acts."""
+        return self.experiment.drive.resolve_place(name.partition(".")[0])
 
     def _scales_at(self, place: str) -> Scales:
         if place in self._scales:
@@ -348,10 +352,9 @@ class Linear:
         """Periods a turn of the waves that effects on a side have."""
         harmonics: list[float] = []
         for effect in self.experiment.effects:
-            roles = type(effect).roles()
             acts = any(float(getattr(effect, leaf)) != 0.0 for leaf in effect.sizes())
             if acts and self.experiment.drive.resolve_place(effect.place) == side:
-                harmonics += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
+                harmonics += [float(getattr(effect, leaf)) for leaf in type(effect).roles("harmonic")]
         return tuple(harmonics)
 
     def choices(self, name: str) -> float:
@@ -361,7 +364,7 @@ class Linear:
             if role.kind == "frequency":
                 count *= max(self.count * self.period * self._highest, 1.0)
             elif role.kind == "harmonic":
-                log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
+                log = self._scales_at(self._place_of(name))
                 count *= max(len(role.trials(log)) if role.trial_count is None else role.trial_count(log), 1)
         return float(np.log(count))
 
@@ -508,7 +511,7 @@ class Linear:
     def shows(self, name: str, numbers: Numbers) -> bool:
         """Tell whether the log can show an effect with these numbers: a gap three times as wide as any twist, or contacts
         that bend over a third of the motion, would look like another effect."""
-        log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
+        log = self._scales_at(self._place_of(name))
         return all(
             numbers[leaf] <= np.exp(REACH) * max(role.trials(log), default=np.inf)
             for leaf, role in EFFECTS[name].roles().items()

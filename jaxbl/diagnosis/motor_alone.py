@@ -17,7 +17,7 @@ from scipy.special import expit
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
-from jaxbl.drive.parameters import as_arrays, parameters, units_of
+from jaxbl.drive.parameters import as_arrays, units_of
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, search_gap
@@ -92,9 +92,10 @@ def list_sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str
         if name in exact:
             continue
         cls, place = EFFECTS[name], name.partition(".")[0]
-        numbers = [parameter.role.kind for _, parameter in parameters(cls) if parameter.role is not None]
         play = cls.free_play is not AbstractEffect.free_play and cls.suits(experiment.transmission)
-        dry = cls.dry_friction is not AbstractEffect.dry_friction and numbers == ["size"]
+        dry = cls.dry_friction is not AbstractEffect.dry_friction and [role.kind for role in cls.roles().values()] == [
+            "size"
+        ]
         if play or (dry and place in ("motor", "load") and (cls.exclusive, place) not in taken):
             names.append(name)
     return names

@@ -278,10 +278,12 @@ class AbstractEffect(eqx.Module):
     # class methods for a diagnosis
 
     @classmethod
-    def roles(cls) -> dict[str, Role]:
-        """Role of each number; empty for an effect that a diagnosis does not try."""
+    def roles(cls, *kinds: str) -> dict[str, Role]:
+        """Role of each number, or of those of some `kinds`; empty for an effect that a diagnosis does not try."""
         roles = {field.name: declaration.role for field, declaration in parameters(cls)}
-        return {} if None in roles.values() else roles  # type: ignore[return-value]
+        if None in roles.values():
+            return {}
+        return {name: role for name, role in roles.items() if not kinds or role.kind in kinds}
 
     @classmethod
     def neutral(cls) -> Numbers:
@@ -291,12 +293,12 @@ class AbstractEffect(eqx.Module):
     @classmethod
     def sizes(cls) -> list[str]:
         """Names of the numbers that its torque is proportional to."""
-        return [name for name, role in cls.roles().items() if role.kind == "size"]
+        return list(cls.roles("size"))
 
     @classmethod
     def list_released(cls, numbers: Numbers) -> list[str]:
         """List the numbers that are held by default, and are not neutral."""
-        return [name for name, role in cls.roles().items() if role.kind == "held" and numbers[name] != role.neutral]
+        return [name for name, role in cls.roles("held").items() if numbers[name] != role.neutral]
 
     @classmethod
     def plainer(cls, numbers: Numbers) -> dict[str, Numbers]:
