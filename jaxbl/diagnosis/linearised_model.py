@@ -451,15 +451,15 @@ class Linear:
         parts = self.errors(smoothness), self.predictor(smoothness).coefficients
         return [errors @ coefficients for errors, coefficients in zip(*parts, strict=True)]
 
-    def products(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> list[Products]:
-        """Products of everything that the prediction errors are linear in, initial states eliminated: of the model alone,
-        and then with each candidate; `noise`: rms of the errors by side, rad."""
-        gain, groups = find_gains(smoothness, self.period), _groups([NO_CANDIDATE, *variants])
+    def products(self, variants: Sequence[Candidate], predictor: Predictor) -> list[Products]:
+        """Products of everything that the prediction errors under a predictor's gain are linear in, over what it leaves of
+        them, initial states eliminated: of the model alone, and then with each candidate."""
+        gain, groups = find_gains(predictor.smoothness, self.period), _groups([NO_CANDIDATE, *variants])
         forces_of_all = [[Forces(columns_of(group, signals)) for signals in self.signals] for group in groups]
 
         def multiply(forces: list[Forces]) -> tuple[np.ndarray, np.ndarray]:
             grams = [
-                np.einsum("s,scd->cd", noise**-2.0, steps.grams([gain], force)[0])
+                np.einsum("s,scd->cd", predictor.deviation**-2.0, steps.grams([gain], force)[0])
                 for steps, force in zip(self.steps, forces, strict=True)
             ]
             power = np.sum([self._power(force) for force in forces], axis=0)
@@ -505,7 +505,7 @@ class Linear:
             return np.inf
         # the torque of the input once more
         again = Candidate("input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]})
-        _, with_input = self.products([again], self.best_predictor.smoothness, self.best_predictor.deviation)
+        _, with_input = self.products([again], self.best_predictor)
         return float(np.sqrt(with_input.products[-1, -1]))
 
     def shows(self, name: str, numbers: Numbers) -> bool:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
@@ -173,7 +174,7 @@ def test_numbers_of_waves_are_those_of_the_effect(geared_model):
 def test_products_are_those_of_the_errors(sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
     model = linearise(sides)
-    (alone,) = model.products((), [1e-6] * sides, np.ones(sides))
+    (alone,) = model.products((), SimpleNamespace(smoothness=[1e-6] * sides, deviation=np.ones(sides)))
     columns = prediction_errors(model)
     assert alone.products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(alone.products))
 
@@ -184,7 +185,7 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     variants = variants_of(model.experiment, list(SMALL_NUMBERS), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = np.array([2e-5, 3e-5])
-    models = model.products(variants, smoothness, noise)
+    models = model.products(variants, SimpleNamespace(smoothness=smoothness, deviation=noise))
     assert sum(variant.width for variant in variants) > 2 * module._TOGETHER
     forces = Forces(columns_of(variants, model.signals[0]))
     predicted = model.steps[0].errors(find_gains(smoothness, model.period), forces)
