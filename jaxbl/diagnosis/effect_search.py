@@ -426,30 +426,37 @@ class EffectSearch:
                 yield {plain: law}
 
     def _reduce(self, current: FittedModel, *, thorough: bool) -> Explanation:
-        """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
+        """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these;
+        and hold its numbers to what is stated of them, if they gain nothing by being further off.
 
         Returns:
             The model, what each effect gains, and the special cases of each; unless `thorough`, only these are tried. No
             rivals, and no remainder.
         """
         while True:
-            gains, plainer = dict[str, Gain](), dict[str, list[Trial]]()
+            gains, plainer, fewer = dict[str, Gain](), dict[str, list[Trial]](), None
             for name in current.names:
-                certain = name in self.expected
-                plainer[name] = [] if certain else self._try_plainer(current, name)
-                fewer = next((trial.fitted for trial in plainer[name] if not trial.gain.is_accepted), None)
+                certain, plainer[name] = name in self.expected, []
+                for law in () if certain else self._plain_laws(current, name):
+                    trial = self._ask_for(current, self._exchange(current, name, law), [*law])
+                    plainer[name].append(trial)
+                    if not trial.gain.is_accepted:
+                        fewer = trial.fitted
+                        break
                 if fewer is None and thorough:
                     trial = self._ask_for(current, self._exchange(current, name), certain=certain)
                     gains[name] = trial.gain
                     fewer = None if certain or trial.gain.is_accepted else trial.fitted
                 if fewer is not None:
-                    current = fewer
                     break
-            else:
-                less = self._as_stated(current) if thorough and self.fits is self.rough else None
-                if less is None:
-                    return Explanation(current, gains, {}, plainer, {})
-                current = less
+            if fewer is None and thorough and self.fits is self.rough:
+                less = self.stated.fit(current.numbers, 0.0 * self.stated.prior, current)
+                trial = self._ask_for(current, less, change="hold the numbers to what is stated")
+                if not trial.gain.is_accepted:
+                    self.fits, fewer = self.stated, less
+            if fewer is None:
+                return Explanation(current, gains, {}, plainer, {})
+            current = fewer
 
     def _ask_for(
         self, current: FittedModel, less: FittedModel, law: Sequence[str] = (), change: str = "", *, certain: bool = False
@@ -460,23 +467,6 @@ class EffectSearch:
         change = change or describe_change(current.numbers, less.numbers)
         self._note(change, gain, not (certain or gain.is_accepted), gain.rule, loss=True)
         return Trial(tuple(law), less, gain)
-
-    def _as_stated(self, current: FittedModel) -> FittedModel | None:
-        """Hold numbers to what is stated of them, if they gain nothing by being further off."""
-        less = self.stated.fit(current.numbers, 0.0 * self.stated.prior, current)
-        if self._ask_for(current, less, change="hold the numbers to what is stated").gain.is_accepted:
-            return None
-        self.fits = self.stated
-        return less
-
-    def _try_plainer(self, current: FittedModel, name: str) -> list[Trial]:
-        """Put special cases of an effect in its place, up to one over which it gains nothing."""
-        trials = list[Trial]()
-        for law in self._plain_laws(current, name):
-            trials.append(self._ask_for(current, self._exchange(current, name, law), [*law]))
-            if not trials[-1].gain.is_accepted:
-                break
-        return trials
 
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit models with another effect in place of one, of the best that were accepted in its round."""

@@ -6,7 +6,6 @@ has, transmission and effects at the smoothed motion, besides its nominal equati
 Otherwise the whole transmitted torque would go through the observer, whose lag on it would be taken for missing torque.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards
 
 from .neutral_effects import complete
-from .residuals import Residual, beyond_nominal, narrow
+from .residuals import Residual, beyond_nominal, low_passed, narrow
 
 _DRAWS = 6
 """Runs over the smoothed motion with drawn noise, by which the observers' own is measured: its deviation to a tenth."""
@@ -181,10 +180,9 @@ def compare_observers(
     for piece, smooth in zip(observed, residuals, strict=True):
         late = filter_forwards(smooth.torque, [share], [share - 1.0])
         low, _ = narrow(piece.residual, cutoff)
-        beside = dataclasses.replace(piece.residual, torque=late[piece.skipped :])
         seen_torques.append(low.torque)
         noise.append(low.deviation)
-        other.append(narrow(beside, cutoff)[0].torque)
+        other.append(low_passed(late[piece.skipped :], piece.residual, cutoff))
         bandwidth = low.bandwidth
     mine, theirs = np.concatenate(seen_torques), np.concatenate(other)
     size = math.sqrt(np.mean(mine**2) * np.mean(theirs**2))
