@@ -23,7 +23,7 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
 from .choice import Choice, Chosen
-from .confidence import confirm, explained_share
+from .confidence import explained_share
 from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_summary import (
     describe_gap,
@@ -145,7 +145,9 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         # the model stands; only now what was held out is read
         announce("testing on held-out data")
         proof = prove(setup, chosen)
-        chosen = chosen._replace(findings=confirm(chosen.findings, proof.holdout_z))
+        # of an effect that does not act there nothing is said
+        confirmed = tuple(finding.confirm(proof.holdout_z.get(finding.effect, np.inf)) for finding in chosen.findings)
+        chosen = chosen._replace(findings=confirmed)
         share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
         apart = contradictions(task, fitted, setup.fitted, chosen.driving)
         judgement = judge(chosen, proof, share, bool(apart))

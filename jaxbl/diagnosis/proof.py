@@ -24,7 +24,6 @@ from .blocks import standard_errors_better
 from .candidates import ZERO_SPREAD, owner_of
 from .choice import Chosen
 from .expected_errors import Expected, expected_errors, list_failed
-from .fitted_model import FittedModel
 from .linearised_model import find_driving_torque
 from .neutral_effects import without
 from .reference_log import Comparison, Errors, ReferenceLog
@@ -84,19 +83,17 @@ def _take_zeros(chosen: Chosen, log: ReferenceLog) -> tuple[Chosen, ReferenceLog
     names = [owner_of(number)[0] for number in chosen.fitted.free]
     zeros = [i for i, name in enumerate(names) if name in EFFECTS and EFFECTS[name].in_log]
     for i in zeros:
-        chosen = chosen._replace(fitted=_fit_zero(chosen.fitted, i, first))
+        # the twist at which two encoders show no torque
+        fitted = chosen.fitted
+        number, theta, white = fitted.free[i], fitted.theta.copy(), fitted.white.copy()
+        free = make_free_parameters(fitted.experiment, [number.path], 1.0)
+        spread = np.array([ZERO_SPREAD / free[0].scale])
+        zero = ModelFits(fitted.experiment, free, spread, first.segments).fit({}, np.zeros(1))
+        theta[i] = number.theta(free[0].value(zero.theta[0]))
+        white[i, i] = zero.covariance[0, 0] * (free[0].scale / number.scale) ** 2
+        experiment = set_free_parameters(fitted.experiment, fitted.free, theta)
+        chosen = chosen._replace(fitted=fitted._replace(theta=theta, white=white, experiment=experiment))
     return (chosen, replace(later, at_rest=False)) if zeros else (chosen, log)
-
-
-def _fit_zero(fitted: FittedModel, i: int, log: ReferenceLog) -> FittedModel:
-    """Fit the twist at which two encoders show no torque, the i-th number of a model, to a log."""
-    number, theta, white = fitted.free[i], fitted.theta.copy(), fitted.white.copy()
-    free = make_free_parameters(fitted.experiment, [number.path], 1.0)
-    spread = np.array([ZERO_SPREAD / free[0].scale])
-    zero = ModelFits(fitted.experiment, free, spread, log.segments).fit({}, np.zeros(1))
-    theta[i] = number.theta(free[0].value(zero.theta[0]))
-    white[i, i] = zero.covariance[0, 0] * (free[0].scale / number.scale) ** 2
-    return fitted._replace(theta=theta, white=white, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
 
 
 def prove(setup: Setup, chosen: Chosen) -> Proof:
