@@ -144,7 +144,7 @@ def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callab
 
 def _variants(name: str, log: Scales) -> Iterator[Candidate]:
     """An effect at all values tried of the numbers that its torque is not proportional to."""
-    held = {leaf: role.neutral for leaf, role in EFFECTS[name].roles("held").items()}
+    held = EFFECTS[name].neutral("held")
     for values in _combine_trials(name, log, "harmonic", "frequency", "shape"):
         fixed = held | values
         if EFFECTS[name].sizes():

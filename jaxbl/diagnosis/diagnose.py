@@ -140,7 +140,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         tables = choice.tabulate(chosen, lacking_after)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
         values = free_values(setup.free, fitted.theta) | gain_values
-        model = extended_study(task.config, fitted.numbers, values, task.record, tables.effects() if tables else ())
+        model = extended_study(task, fitted.numbers, values, tables.effects() if tables else ())
         done()
         # the model stands; only now what was held out is read
         announce("testing on held-out data")
@@ -179,7 +179,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if tables is not None:
             summary["torque_tables"] = tables.summarise(proof.log, proof.after)
         if chosen.rival is not None:
-            summary["rival"] = rival_tables(task.config, task.record, setup.free, chosen.rival)
+            summary["rival"] = rival_tables(setup, chosen.rival)
         done()
     before, after = missing["missing_before"], missing["missing_after"]
     pairs = {

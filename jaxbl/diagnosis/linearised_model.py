@@ -365,7 +365,7 @@ class Linear:
                 count *= max(self.count * self.period * self._highest, 1.0)
             elif role.kind == "harmonic":
                 log = self._scales_at(self._place_of(name))
-                count *= max(len(role.trials(log)) if role.trial_count is None else role.trial_count(log), 1)
+                count *= max(log.wave_count if role.among_waves else len(role.trials(log)), 1)
         return float(np.log(count))
 
     @property

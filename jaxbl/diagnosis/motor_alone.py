@@ -111,7 +111,7 @@ def _set_up(task: DiagnosisTask) -> _Search:
         for name in names
     }
     added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in first.items()]
-    model = with_effects(bare, tuple(with_added(bare.effects, added, lambda effect: effect.name)))
+    model = with_effects(bare, tuple(with_added(bare.effects, added)))
     own_paths = default_paths(config, bare)
     paths = [f"effects.{name}.{next(iter(numbers))}" for name, numbers in first.items()]
     at_rest = config.log.initial_state == "rest"
@@ -154,7 +154,7 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     numbers = {name: {path.rpartition(".")[2]: alone.values[path]} for name, path in paths.items()}
     summary = _summary(task, held_out, search, alone, gains, numbers) | {"history": describe_history(history)}
     numbers_of_model = {number.path: alone.values[number.path] for number in search.free}
-    study = extended_study(task.config, numbers, numbers_of_model, task.record)
+    study = extended_study(task, numbers, numbers_of_model)
     done()
     return study, held_out, summary, pd.DataFrame(columns_alone(task.record, alone))
 

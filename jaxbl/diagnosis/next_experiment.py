@@ -141,7 +141,7 @@ def with_gap(model: Config, path: str, half: float) -> Config:
         data = model.to_dict()
         gap = f"transmission.{Backlash.kind}"
         effects = [effect for effect in data.get("effects", []) if effect["kind"] != gap]
-        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}], lambda effect: effect["kind"])
+        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}])
         return read_config(data)
     return with_values(model, {path: half / (4.0 if path.endswith("dead_zone") else 1.0)})
 

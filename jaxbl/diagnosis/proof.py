@@ -5,7 +5,6 @@ is fitted but the state in which each window begins, from the window's first fif
 the zeros of its encoders, where the model has those of its own, from the log's first fifth, which is not scored either.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -97,7 +96,7 @@ def _take_zeros(chosen: Chosen, log: ReferenceLog) -> tuple[Chosen, ReferenceLog
 
 
 def prove(setup: Setup, chosen: Chosen) -> Proof:
-    """Open what was held out, and compare the model that stands with it."""
+    """Open what was held out, and compare the model that stands with it, as it is and without one effect after the other."""
     record, log = open_held_out(setup)
     if setup.task.separate:
         chosen, log = _take_zeros(chosen, log)
@@ -107,7 +106,15 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     sizes = _sizes(log, fitted.experiment)
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
-    untested, holdout_z = _leave_out_each(setup, chosen, log, after, expected)
+    untested, holdout_z, model = {}, {}, fitted.experiment
+    for name in fitted.names:
+        less = without(model, name)
+        compared = log.compare(less)
+        torques = {"torque": _torque_between(log, model, less), "on_log": _torque_between(setup.fitted, model, less)}
+        if torques["torque"] > ACTS * torques["on_log"]:
+            holdout_z[name] = standard_errors_better(log, compared, after)
+        if not list_failed(compared.errors, expected):
+            untested[name] = torques
     return Proof(
         record, log, before, after, expected,
         # what tests nothing contradicts nothing
@@ -123,23 +130,6 @@ def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
     driving, _ = find_driving_torque(experiment, log.segments)
     sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
     return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
-
-
-def _leave_out_each(
-    setup: Setup, chosen: Chosen, log: ReferenceLog, after: Comparison, expected: Mapping[str, Expected]
-) -> tuple[JsonObject, dict[str, float]]:
-    """Leave out one effect after the other: those without which the model would leave no more than a complete one may, and
-    the standard errors by which it predicts better with each that acts there."""
-    untested, holdout_z, model = {}, {}, chosen.fitted.experiment
-    for name in chosen.fitted.names:
-        less = without(model, name)
-        compared = log.compare(less)
-        torques = {"torque": _torque_between(log, model, less), "on_log": _torque_between(setup.fitted, model, less)}
-        if torques["torque"] > ACTS * torques["on_log"]:
-            holdout_z[name] = standard_errors_better(log, compared, after)
-        if not list_failed(compared.errors, expected):
-            untested[name] = torques
-    return untested, holdout_z
 
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:

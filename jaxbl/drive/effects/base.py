@@ -96,14 +96,14 @@ class Role(NamedTuple):
         neutral: the number with which the effect does nothing.
         trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
-        trial_count: number of values among which a harmonic was chosen, if that is not the number of `trials`.
+        among_waves: whether a harmonic was chosen among all waves that a log tells apart, and not among `trials` alone.
     """
 
     kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
     neutral: float
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
-    trial_count: Callable[[Scales], int] | None = None
+    among_waves: bool = False
 
 
 def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
@@ -119,15 +119,9 @@ def angle(doc: str) -> Any:
     return parameter("rad", doc, default=0.0, role=Role("angle", 0.0, lambda log: (0.0,), 1.8))
 
 
-def harmonic(
-    doc: str,
-    trials: Callable[[Scales], Sequence[float]],
-    *,
-    trial_count: Callable[[Scales], int] | None = None,
-    **limits: Any,
-) -> Any:
+def harmonic(doc: str, trials: Callable[[Scales], Sequence[float]], *, among_waves: bool = False, **limits: Any) -> Any:
     """Declare a number of periods a turn, which is chosen among the values of `trials`."""
-    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, trial_count=trial_count), **limits)
+    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, among_waves=among_waves), **limits)
 
 
 def frequency(doc: str) -> Any:
@@ -286,9 +280,9 @@ class AbstractEffect(eqx.Module):
         return {name: role for name, role in roles.items() if not kinds or role.kind in kinds}
 
     @classmethod
-    def neutral(cls) -> Numbers:
-        """Numbers with which the effect does nothing; empty for an effect without :meth:`roles`."""
-        return {name: role.neutral for name, role in cls.roles().items()}
+    def neutral(cls, *kinds: str) -> Numbers:
+        """Numbers with which the effect does nothing, or some `kinds` of them; empty for an effect without :meth:`roles`."""
+        return {name: role.neutral for name, role in cls.roles(*kinds).items()}
 
     @classmethod
     def sizes(cls) -> list[str]:
