@@ -129,20 +129,14 @@ class Explanation(NamedTuple):
         gains: over the model without an effect, by effect.
         rivals: models with another effect in place of one of these, and what the found one gains over each, by effect.
         plainer: the same with a plain law of it.
-        remainder: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size
-            among those tried, as a share of the driving torque.
+        largest_gain: nats that a free function of time, position or velocity gains at most.
     """
 
     fitted: FittedModel
     gains: dict[str, Gain]
     rivals: dict[str, list[Trial]]
     plainer: dict[str, list[Trial]]
-    remainder: dict[str, tuple[float, float]]
-
-    @property
-    def largest_gain(self) -> float:
-        """Largest gain of the free functions that are large enough for an effect, nats."""
-        return max((gain for gain, share in self.remainder.values() if share > LIMITS.least_torque), default=0.0)
+    largest_gain: float
 
     def odds_of(self, plain: Trial) -> float:
         """Odds of a plain law in place of an effect: by the gain over it; and what parts them may be something unknown."""
@@ -281,7 +275,7 @@ class EffectSearch:
         """Fit rivals to what was found, and free functions to what remains."""
         current = reduced.fitted
         rivals = {name: self._rivals(current, name) for name in current.names}
-        return reduced._replace(rivals=rivals, remainder=self.remainder(current))
+        return reduced._replace(rivals=rivals, largest_gain=self.find_largest_gain(current))
 
     def leave_out(self, explanation: Explanation, name: str, plain: Trial | None) -> Explanation:
         """Explain a log without an effect that was found, or with a plain law of it, as something unknown is likelier in the
@@ -431,7 +425,7 @@ class EffectSearch:
 
         Returns:
             The model, what each effect gains, and the special cases of each; unless `thorough`, only these are tried. No
-            rivals, and no remainder.
+            rivals, and nothing that remains.
         """
         while True:
             gains, plainer, fewer = dict[str, Gain](), dict[str, list[Trial]](), None
@@ -455,7 +449,7 @@ class EffectSearch:
                 if not trial.gain.is_accepted:
                     self.fits, fewer = self.stated, less
             if fewer is None:
-                return Explanation(current, gains, {}, plainer, {})
+                return Explanation(current, gains, {}, plainer, 0.0)
             current = fewer
 
     def _ask_for(
@@ -594,11 +588,12 @@ class EffectSearch:
         explained = 0.5 * errors * float(np.log(max(base.misfit, 1e-300) / max(evidence.misfit, 1e-300)))
         return evidence.log_evidence - base.log_evidence + 0.5 * (evidence.misfit - base.misfit) + explained
 
-    def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
-        """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
+    def find_largest_gain(self, fitted: FittedModel) -> float:
+        """Find what a free function gains at most beside a model, nats, of those that are large enough for an effect at the
+        most likely size of those tried."""
         linear = fitted.linear
         alone, *models = linear.products(functions_of(linear.signals), linear.best_predictor)
-        none, gained = evidence_of(alone), {}
+        none, gains = evidence_of(alone), []
         for columns in models:
             best = (-np.inf, 0.0)
             for size in _SIZES:
@@ -609,8 +604,9 @@ class EffectSearch:
                 if none is not None and with_function is not None:
                     nats = self._nats(linear, none, with_function)
                     best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
-            gained[columns.candidate.name] = best
-        return gained
+            if best[1] > LIMITS.least_torque:
+                gains.append(best[0])
+        return max(gains, default=0.0)
 
 
 def _law(name: str, numbers: Numbers) -> tuple:

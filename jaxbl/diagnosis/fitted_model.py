@@ -84,8 +84,8 @@ class FittedModel(NamedTuple):
 
     def missed_share(self, name: str) -> float:
         """Torque that laws of the other effects may miss, as :meth:`share`."""
-        laws = [effect for effect in self.experiment.effects if type(effect).law_error and effect.name != name]
-        return float(np.linalg.norm([type(effect).law_error * self.linear.torque_share(effect) for effect in laws]))
+        laws = [effect for effect in self.experiment.effects if effect.law_error and effect.name != name]
+        return float(np.linalg.norm([effect.law_error * self.linear.torque_share(effect) for effect in laws]))
 
     def counts(self, name: str) -> bool:
         """Tell whether the log shows an effect, and its torque is large enough to be named; of a finer law, what parts it

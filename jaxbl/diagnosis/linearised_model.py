@@ -219,17 +219,14 @@ class Predictor:
         prior, centre = np.full(width, np.inf), np.zeros(width)
         prior[:own_count], centre[:own_count] = self.prior, -self.theta
         for turn in range(2):
-            weighted = [np.einsum("s,scd->cd", weight, gram) for gram in grams]
-            responses = [_response_and_loss(gram, states) for gram in weighted]
-            total = np.sum(
-                [_without(gram, states, response) for gram, (response, _) in zip(weighted, responses, strict=True)], axis=0
-            )
+            eliminated = [_eliminate(np.einsum("s,scd->cd", weight, gram), states) for gram in grams]
+            total = np.sum([rest for rest, _, _ in eliminated], axis=0)
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
-            lost = sum(loss for _, loss in responses) / variance
+            lost = sum(loss for _, _, loss in eliminated) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 return
             free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre)])
-            coefficients = [np.concatenate([free, -response @ free]) for response, _ in responses]
+            coefficients = [np.concatenate([free, -response @ free]) for _, response, _ in eliminated]
             left = [np.einsum("c,scd,d->s", vector, gram, vector) for vector, gram in zip(coefficients, grams, strict=True)]
             squares = np.sum(left, axis=0)
             if not (squares > 0.0).all():
@@ -463,7 +460,7 @@ class Linear:
                 for steps, force in zip(self.steps, forces, strict=True)
             ]
             power = np.sum([self._power(force) for force in forces], axis=0)
-            return np.sum([_eliminate(gram, self.states) for gram in grams], axis=0), power
+            return np.sum([_eliminate(gram, self.states)[0] for gram in grams], axis=0), power
 
         # the constant and the own numbers come first
         shared, models = 1 + len(self.free), list[Products]()
@@ -581,16 +578,20 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
     total = np.einsum("s,scd->cd", weight, grams)
     vector = np.zeros(total.shape[0])
     vector[0] = 1.0
-    vector[-states:] = -_response_and_loss(total, states)[0][:, 0]
+    vector[-states:] = -_eliminate(total, states)[1][:, 0]
     return np.einsum("c,scd,d->s", vector, grams, vector)
 
 
-def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float]:
-    """Find what the initial states, which may be all but alike, take off the other columns; and what rounding may take off
-    the square of the first column with it."""
-    inner = gram[-states:, -states:]
+def _eliminate(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Take the initial states, the last columns, which may be all but alike, off the others.
+
+    Returns:
+        Products of the others without what the states explain, coefficients of the states for each of the others, and what
+        rounding may take off the square of the first column.
+    """
+    others, across, inner = gram[:-states, :-states], gram[-states:, :-states], gram[-states:, -states:]
     if not np.isfinite(inner).all():  # of a model that diverges
-        return np.zeros_like(gram[-states:, :-states]), 0.0
+        return np.full_like(others, np.nan), np.zeros_like(across), 0.0
     # infinite where a state does nothing
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
     size = np.where(size > SILENT * np.max(size), size, np.inf)
@@ -598,16 +599,8 @@ def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float
     largest = np.max(np.abs(values))
     significant = np.abs(values) > _ALIKE * largest
     inverse = (vectors * np.where(significant, 1.0 / np.where(significant, values, 1.0), 0.0)) @ vectors.T
-    response = (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
+    response = (inverse @ (across / size[:, None])) / size[:, None]
     # a state without influence has a zero of its own among these
     least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest
-    return response, float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT)) if largest > 0.0 else 0.0
-
-
-def _without(gram: np.ndarray, states: int, response: np.ndarray) -> np.ndarray:
-    return gram[:-states, :-states] - gram[:-states, -states:] @ response
-
-
-def _eliminate(gram: np.ndarray, states: int) -> np.ndarray:
-    """Products of columns without what the last of them, the initial states, explain."""
-    return _without(gram, states, _response_and_loss(gram, states)[0])
+    lost = float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT)) if largest > 0.0 else 0.0
+    return others - across.T @ response, response, lost

@@ -87,7 +87,7 @@ def list_sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str
     `exact`: names of effects that are surely not missing.
     """
     names = []
-    taken = {(type(effect).exclusive, effect.place) for effect in experiment.effects}
+    taken = {(effect.exclusive, effect.place) for effect in experiment.effects}
     for name in candidates(experiment):
         if name in exact:
             continue
@@ -142,7 +142,25 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     history: list[Step] = []
     # a gap of its own stays as free as it is
     out, point = ([], gap.best) if gap is not None and (gap.is_needed or not search.play) else (search.play, point)
-    point, gains = _drop_needless(search, point, out, history)
+    while True:
+        # without the frictions that are not needed, and what each other one gains
+        frictions = [name for name in search.effects if name not in (*out, *search.play)]
+        points = {name: search.finish(point, [*out, name]) for name in frictions}
+        inflation, gains = search.without(out).spread(point).inflation, dict[str, float]()
+        # minus twice the log-likelihood by which a friction makes the fit better, correlation of the errors counted; without
+        # the prior of its level: none at all is far from any level that a fit begins with
+        for name, less in points.items():
+            i = search.effects[name]
+            prior = (less.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
+            gains[name] = float((less.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
+        least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
+        needless = None if least is None or gains[least] >= SHOWN else least
+        for name, gain in gains.items():
+            history.append(Step(f"remove {name}", -0.5 * gain, None, name == needless, f"{0.5 * SHOWN:g} nats are asked"))
+        if needless is None:
+            break
+        out.append(needless)
+        point = points[needless]
     gains |= {name: gap.gain for name in search.play if gap is not None}
     model = search.without(out)
     alone = alone_of(search.model, *model.settle(point), model.held, gap, np.e, task.record)
@@ -157,30 +175,6 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     study = extended_study(task, numbers, numbers_of_model)
     done()
     return study, held_out, summary, pd.DataFrame(columns_alone(task.record, alone))
-
-
-def _drop_needless(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
-    """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
-    tried goes into the history."""
-    while True:
-        frictions = [name for name in search.effects if name not in (*out, *search.play)]
-        points = {name: search.finish(point, [*out, name]) for name in frictions}
-        inflation, gains = search.without(out).spread(point).inflation, {}
-        # minus twice the log-likelihood by which a friction makes the fit better, correlation of the errors counted; without
-        # the prior of its level: none at all is far from any level that a fit begins with
-        for name, less in points.items():
-            i = search.effects[name]
-            prior = (less.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
-            gains[name] = float((less.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
-        least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
-        needless = least is not None and not gains[least] >= SHOWN
-        for name, gain in gains.items():
-            reason = f"{0.5 * SHOWN:g} nats are asked"
-            history.append(Step(f"remove {name}", -0.5 * gain, None, needless and name == least, reason))
-        if least is None or not needless:
-            return point, gains
-        out.append(least)
-        point = points[least]
 
 
 def _summary(

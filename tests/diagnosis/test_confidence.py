@@ -30,9 +30,8 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, l
         errors=lambda: {f"effects.{name}.torque": error} | {f"effects.{name}.{leaf}": 0.1 * error for leaf in numbers},
     )
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
-    remainder = {"motor.time": (unknown, 0.1)}
     plainer = [] if plain is None else [Trial((NAME,), fitted, Gain(*plain))]
-    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, remainder)
+    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, unknown)
     (finding,) = weigh(explanation, 0.2 * left)
     return finding
 
