@@ -13,8 +13,8 @@ from jaxbl.drive.parameters import get_leaf
 
 from .effect_search import Explanation
 from .expected_errors import Expected
-from .fitted_model import FittedModel
 from .reference_log import Errors
+from .refit import FittedModel
 from .thresholds import LIMITS
 
 LEAST_CHANCE = 0.01

@@ -35,13 +35,12 @@ from .candidates import (
     variants_of,
 )
 from .evidence import Evidence, Products, evidence_of
-from .fitted_model import FittedModel
 from .free_functions import functions_of
 from .history import Step, describe_change
 from .linearised_model import Linear, Predictor
 from .neutral_effects import candidates, find_corrected
 from .reference_log import Comparison, ReferenceLog
-from .refit import ModelFits
+from .refit import FittedModel, ModelFits
 from .thresholds import LIMITS
 from .torque_regression import SHOWN, TorqueRegression
 

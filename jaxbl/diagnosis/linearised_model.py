@@ -589,9 +589,11 @@ def _eliminate(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray, f
         Products of the others without what the states explain, coefficients of the states for each of the others, and what
         rounding may take off the square of the first column.
     """
-    others, across, inner = gram[:-states, :-states], gram[-states:, :-states], gram[-states:, -states:]
-    if not np.isfinite(inner).all():  # of a model that diverges
-        return np.full_like(others, np.nan), np.zeros_like(across), 0.0
+    inner, across, lost = gram[-states:, -states:], gram[-states:, :-states], 0.0
+    # of a model that diverges
+    if not np.isfinite(inner).all():
+        response = np.zeros_like(across)
+        return gram[:-states, :-states] - gram[:-states, -states:] @ response, response, lost
     # infinite where a state does nothing
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
     size = np.where(size > SILENT * np.max(size), size, np.inf)
@@ -602,5 +604,6 @@ def _eliminate(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray, f
     response = (inverse @ (across / size[:, None])) / size[:, None]
     # a state without influence has a zero of its own among these
     least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest
-    lost = float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT)) if largest > 0.0 else 0.0
-    return others - across.T @ response, response, lost
+    if largest > 0.0:
+        lost = float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT))
+    return gram[:-states, :-states] - gram[:-states, -states:] @ response, response, lost

@@ -20,8 +20,8 @@ from jaxbl.quantity import Quantity
 from jaxbl.records.least_squares import BlockRegression, column_rms, rms
 
 from .diagnosis_task import DiagnosisTask
-from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
+from .refit import FittedModel
 from .thresholds import LIMITS
 
 _STEP = 1e-3
