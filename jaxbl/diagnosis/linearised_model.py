@@ -329,6 +329,11 @@ class Linear:
         ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
         if len(self.sides) == 2:
             twist = join(lambda part: part.position["motor"] - ratio * part.position["load"])
+        harmonics: list[float] = []
+        for effect in self.experiment.effects:
+            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf in effect.sizes())
+            if acts and self.experiment.drive.resolve_place(effect.place) == side:
+                harmonics += [float(getattr(effect, leaf)) for leaf in effect.roles("harmonic")]
         self._scales[place] = Scales(
             torque=float(np.max(np.abs(join(lambda part: part.torque)))),
             period=self.period,
@@ -340,19 +345,10 @@ class Linear:
             travel=float(np.ptp(position)),
             noise=self._noise[side],
             ratio=ratio,
-            harmonics=self._harmonics(side),
+            harmonics=tuple(harmonics),
             wave_count=int(np.clip(0.5 * np.pi / max(slow * self.period, 1e-9), 1, _MOST_WAVES)),
         )
         return self._scales[place]
-
-    def _harmonics(self, side: str) -> tuple[float, ...]:
-        """Periods a turn of the waves that effects on a side have."""
-        harmonics: list[float] = []
-        for effect in self.experiment.effects:
-            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf in effect.sizes())
-            if acts and self.experiment.drive.resolve_place(effect.place) == side:
-                harmonics += [float(getattr(effect, leaf)) for leaf in type(effect).roles("harmonic")]
-        return tuple(harmonics)
 
     def choices(self, name: str) -> float:
         """Logarithm of the number of values that an effect was sought with, where each could be told from the next."""

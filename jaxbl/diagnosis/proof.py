@@ -25,7 +25,7 @@ from .choice import Chosen
 from .expected_errors import Expected, expected_errors, list_failed
 from .linearised_model import find_driving_torque
 from .neutral_effects import without
-from .reference_log import Comparison, Errors, ReferenceLog
+from .reference_log import Comparison, ReferenceLog
 from .refit import ModelFits
 from .setup import Setup, quiet
 from .thresholds import LIMITS
@@ -103,7 +103,10 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
     fitted = chosen.fitted
     before, after = log.compare(setup.nominal), log.compare(fitted.experiment)
     expected = expected_errors(log, fitted, after, setup.input_noise, chosen.driving)
-    sizes = _sizes(log, fitted.experiment)
+    # of what is to be predicted: the motion of each side about its mean, rad, and the torque that drives it, N m, rms
+    driving, _ = find_driving_torque(fitted.experiment, log.segments)
+    sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
+    sizes |= {f"torque_{side}": driving * float(fitted.experiment.drive.ratio(side)) for side in fitted.experiment.sides}
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
     untested, holdout_z, model = {}, {}, fitted.experiment
@@ -120,16 +123,8 @@ def prove(setup: Setup, chosen: Chosen) -> Proof:
         # what tests nothing contradicts nothing
         [name for name in list_failed(after.errors, expected) if name not in weak],
         bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
-        weak, untested, holdout_z, sizes["torque_motor"],
+        weak, untested, holdout_z, driving,
     )  # fmt: skip
-
-
-def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
-    """Size of what is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives
-    it, N m, rms."""
-    driving, _ = find_driving_torque(experiment, log.segments)
-    sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
-    return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
 
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:
