@@ -375,7 +375,7 @@ class EffectSearch:
         as_proposed = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
         fitted = self._simplify(as_proposed)
         staying = [name for name in old if name in fitted.names or any(contains(name, plain) for plain in fitted.names)]
-        before = {_law(name, numbers) for name, numbers in current.numbers.items()}
+        _, before = self._identify(current)
         added = [
             name
             for name, numbers in fitted.numbers.items()

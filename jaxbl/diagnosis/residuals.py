@@ -119,15 +119,16 @@ def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.nda
     return accelerations.T.reshape(values.shape)
 
 
-class _Equation(NamedTuple):
+class Equation(NamedTuple):
     """Equation of motion of a side along a part, torques in N m.
 
     Attributes:
         inertia: of the side, kg m^2.
         taken: by it.
         modelled: that the smoother sees.
-        beyond: modelled less that of the nominal equation, in which the inertia is the nominal one; without dry friction.
-        friction: dry friction.
+        beyond: modelled less that of the nominal equation J dv/dt = (input) - B v, the right-hand side that an observer
+            (7)-(8) knows; without dry friction.
+        friction: dry friction, which is to be subtracted from that.
         by_position, by_velocity: derivatives of the modelled torque by the positions and velocities.
     """
 
@@ -141,7 +142,7 @@ class _Equation(NamedTuple):
 
 
 @jit
-def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, _Equation]:
+def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, Equation]:
     """Equations of all sides along a part; `held`: where a side is not shown to move for a while."""
     states, torque = effect_path(experiment, part)
     drive, equations = experiment.drive, {}
@@ -181,24 +182,16 @@ def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Ar
         added = (inertia - drive.inertia(side)) * acceleration
         nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
         by_velocity = by_velocity | {side: by_velocity[side] - turning}
-        equations[side] = _Equation(
+        equations[side] = Equation(
             inertia, inertia * acceleration, modelled, total - added - nominal, friction, by_position, by_velocity
         )
     return equations
 
 
-def _along(experiment: Experiment, segment: Segment) -> dict[str, _Equation]:
+def evaluate_equations(experiment: Experiment, segment: Segment) -> dict[str, Equation]:
+    """Evaluate the equation of motion of each side along a segment."""
     held = {side: smoothed.find_standstill(segment.period) for side, smoothed in segment.smoothed.items()}
     return jax.tree.map(np.asarray, _equations(experiment, segment.kinematics, held))
-
-
-def beyond_nominal(experiment: Experiment, segment: Segment) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Modelled torque on each side less that of its nominal equation, in which the inertia is the nominal one, N m.
-
-    What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
-    on its own, the dry friction that is to be subtracted.
-    """
-    return {side: (equation.beyond, equation.friction) for side, equation in _along(experiment, segment).items()}
 
 
 def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> SideResiduals:
@@ -213,7 +206,7 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
     for segment in segments:
         part, responses = segment.kinematics, _responses(segment)
         sensor = 0.0 if part.transmitted is None else estimate_white_noise([np.asarray(part.transmitted)])
-        equations = _along(experiment, segment)
+        equations = evaluate_equations(experiment, segment)
         for side, pieces in residuals.items():
             equation = equations[side]
             missing = equation.taken - as_smoothed(equation.modelled, segment.smoothed[side], segment.period)
@@ -239,7 +232,7 @@ def _responses(segment: Segment) -> dict[str, _Response]:
 def _noise(
     segment: Segment,
     side: str,
-    equation: _Equation,
+    equation: Equation,
     sensor: float,
     responses: Mapping[str, _Response],
 ) -> tuple[np.ndarray, np.ndarray]:
