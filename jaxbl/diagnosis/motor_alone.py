@@ -92,10 +92,9 @@ def list_sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str
         if name in exact:
             continue
         cls, place = EFFECTS[name], name.partition(".")[0]
+        numbers = [role.kind for role in cls.roles().values()]
         play = cls.free_play is not AbstractEffect.free_play and cls.suits(experiment.transmission)
-        dry = cls.dry_friction is not AbstractEffect.dry_friction and [role.kind for role in cls.roles().values()] == [
-            "size"
-        ]
+        dry = cls.dry_friction is not AbstractEffect.dry_friction and numbers == ["size"]
         if play or (dry and place in ("motor", "load") and (cls.exclusive, place) not in taken):
             names.append(name)
     return names
@@ -142,8 +141,8 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     history: list[Step] = []
     # a gap of its own stays as free as it is
     out, point = ([], gap.best) if gap is not None and (gap.is_needed or not search.play) else (search.play, point)
+    # frictions without which the log is met as well go one after the other
     while True:
-        # without the frictions that are not needed, and what each other one gains
         frictions = [name for name in search.effects if name not in (*out, *search.play)]
         points = {name: search.finish(point, [*out, name]) for name in frictions}
         inflation, gains = search.without(out).spread(point).inflation, dict[str, float]()
@@ -183,9 +182,8 @@ def _summary(
     """Make `diagnosis.json`, but for the history; `numbers` of the effects that are left."""
     record, model, values = task.record, search.model, alone.values
     noise, unit = model.noise, record.unit_of("motor.position", "rad")
-    deviation = np.sqrt(np.diag(alone.search_fit.spread.covariance))
-    errors = dict.fromkeys(values, float("nan"))
-    errors |= {number.path: values[number.path] * deviation[i] for i, number in enumerate(alone.search_fit.free)}
+    deviations, errors = alone.search_fit.spread.deviations, dict.fromkeys(values, float("nan"))
+    errors |= {number.path: values[number.path] * deviations[i] for i, number in enumerate(alone.search_fit.free)}
     holdout = alone_on_holdout(held_out, alone, search.none)["position"]["motor"]
     limit = (1.0 + _NOISE_ERROR) * max(alone.point.variance**0.5, noise)
     left, size = model.measure_unexplained(alone.point), input_rms(record)
