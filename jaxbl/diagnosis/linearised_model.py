@@ -180,7 +180,7 @@ _NO_INPUT = 1e-3
 """Input over the torque that the motion takes, rms, below which the drive moves freely."""
 DIVERGED = 1e30
 """Products of prediction errors, over their variance or in rad^2, from which on a model diverges: squares soon overflow."""
-SILENT = 1e-20
+_SILENT = 1e-20
 """Influence of an initial state over that of others, squared, below which it has none (the state of a neutral effect):
 rounding is 1e-16."""
 _ALIKE = 1e-12
@@ -592,7 +592,7 @@ def _eliminate(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray, f
         return gram[:-states, :-states] - gram[:-states, -states:] @ response, response, lost
     # infinite where a state does nothing
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    size = np.where(size > SILENT * np.max(size), size, np.inf)
+    size = np.where(size > _SILENT * np.max(size), size, np.inf)
     values, vectors = np.linalg.eigh(inner / np.outer(size, size))
     largest = np.max(np.abs(values))
     significant = np.abs(values) > _ALIKE * largest
@@ -601,5 +601,5 @@ def _eliminate(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray, f
     # a state without influence has a zero of its own among these
     least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest
     if largest > 0.0:
-        lost = float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT))
+        lost = float(np.finfo(float).eps * gram[0, 0] / max(least / largest, _SILENT))
     return gram[:-states, :-states] - gram[:-states, -states:] @ response, response, lost

@@ -25,11 +25,11 @@ from jaxbl.estimation.regression import begin_states
 from jaxbl.estimation.segments import Segment
 from jaxbl.fused import Arrays
 from jaxbl.fused.single_plant import simulate_plant
-from jaxbl.records.least_squares import BlockRegression
+from jaxbl.records.least_squares import BlockRegression, fit_residual
 
 from .blocks import QUARTERS
 from .candidates import ZERO_SPREAD, EffectNumbers, is_finer_law, owner_of
-from .linearised_model import SILENT, Linear, Predictor, find_gains
+from .linearised_model import Linear, Predictor, find_gains
 from .neutral_effects import complete, lean
 from .reference_log import BLOCKS, parts_of_blocks
 from .thresholds import LIMITS
@@ -380,12 +380,7 @@ class _Fit:
         size = np.sqrt(point.predictor.given / linear.count)
         for errors in linear.errors(point.predictor.smoothness):
             flat = (errors / size[None, :, None]).reshape(-1, errors.shape[2])
-            states = flat[:, -linear.states :]
-            norm = np.sqrt(np.sum(states**2, axis=0))
-            visible = norm > SILENT * np.max(norm)
-            basis = np.linalg.qr(states[:, visible] / norm[visible])[0]
-            projected = flat[:, : 1 + count] - basis @ (basis.T @ flat[:, : 1 + count])
-            pieces.append(projected.reshape(-1, sides, 1 + count))
+            pieces.append(fit_residual(flat[:, : 1 + count], flat[:, -linear.states :]).reshape(-1, sides, 1 + count))
         errors, slopes = np.split(np.concatenate(pieces), [1], axis=2)
         foretold = errors[:, :, 0].copy()
         covariance = inverse = precision = np.zeros((0, 0))
