@@ -57,27 +57,25 @@ class Finding(NamedTuple):
 
 def weigh(explanation: Explanation, left: float = 0.0) -> tuple[Finding, ...]:
     """Weigh the effects that were found; `left`: torque that is still missing, over the driving torque."""
-    return tuple(_weigh(explanation, name, left) for name in explanation.fitted.names)
-
-
-def _weigh(explanation: Explanation, name: str, left: float) -> Finding:
-    fitted, gain = explanation.fitted, explanation.gains[name]
-    odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
-    # what is still unknown may stand in its place, or what laws of other effects miss: odds by the squares of gains, and of
-    # torques, part right from wrong on generated logs
-    parts = [
-        explanation.largest_gain / max(gain.nats, 1.0),
-        left / max(fitted.share(name), 1e-300),
-        fitted.missed_share(name) / max(fitted.own_share(name), 1e-300),
-    ]
-    unknown = max(parts) ** 2
-    odds |= {trial.added[0]: explanation.odds_of(trial) for trial in explanation.plainer[name] if trial.added[0] != name}
-    total = 1.0 + sum(odds.values()) + unknown
-    # no surer than that its torque is not zero, nor than that it makes the model better by blocks
-    least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
-    weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
-    alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
-    return Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives)
+    fitted, findings = explanation.fitted, []
+    for name, gain in explanation.gains.items():
+        odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
+        # what is still unknown may stand in its place, or what laws of other effects miss: odds by the squares of gains, and
+        # of torques, part right from wrong on generated logs
+        parts = [
+            explanation.largest_gain / max(gain.nats, 1.0),
+            left / max(fitted.share(name), 1e-300),
+            fitted.missed_share(name) / max(fitted.own_share(name), 1e-300),
+        ]
+        unknown = max(parts) ** 2
+        odds |= {trial.added[0]: explanation.odds_of(trial) for trial in explanation.plainer[name] if trial.added[0] != name}
+        total = 1.0 + sum(odds.values()) + unknown
+        # no surer than that its torque is not zero, nor than that it makes the model better by blocks
+        least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
+        weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
+        alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
+        findings.append(Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives))
+    return tuple(findings)
 
 
 def _certainty(fitted: FittedModel, name: str) -> float:
