@@ -68,7 +68,7 @@ def _smooth_curve(values: np.ndarray) -> np.ndarray:
     count = len(values)
     # products of third differences, as lower bands
     stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
-    differences = diags_array(stencil, offsets=range(_ORDER + 1), shape=(count - _ORDER, count))
+    differences = diags_array(stencil, offsets=range(_ORDER + 1), shape=(count - _ORDER, count))  # type: ignore[arg-type]
     products = differences.T @ differences
     penalty = np.stack([np.pad(products.diagonal(-apart), (0, apart)) for apart in range(_ORDER + 1)])
     frequency = np.linspace(0.0, np.pi, 4096)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -174,7 +175,8 @@ def test_numbers_of_waves_are_those_of_the_effect(geared_model):
 def test_products_are_those_of_the_errors(sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
     model = linearise(sides)
-    (alone,) = model.products((), SimpleNamespace(smoothness=[1e-6] * sides, deviation=np.ones(sides)))
+    predictor: Any = SimpleNamespace(smoothness=[1e-6] * sides, deviation=np.ones(sides))
+    (alone,) = model.products((), predictor)
     columns = prediction_errors(model)
     assert alone.products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(alone.products))
 
