@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.sparse import diags_array
 
 from .whittle import spectrum_of, weighted_products
 
@@ -68,9 +67,10 @@ def _smooth_curve(values: np.ndarray) -> np.ndarray:
     count = len(values)
     # products of third differences, as lower bands
     stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
-    differences = diags_array(stencil, offsets=range(_ORDER + 1), shape=(count - _ORDER, count))  # type: ignore[arg-type]
-    products = differences.T @ differences
-    penalty = np.stack([np.pad(products.diagonal(-apart), (0, apart)) for apart in range(_ORDER + 1)])
+    penalty = np.zeros((_ORDER + 1, count))
+    for apart in range(_ORDER + 1):
+        products = stencil[apart:] * stencil[: len(stencil) - apart]
+        penalty[apart, : count - apart] = np.convolve(np.ones(count - _ORDER), products)
     frequency = np.linspace(0.0, np.pi, 4096)
     best, least = values, np.inf
     for cutoff in _CUTOFFS:
