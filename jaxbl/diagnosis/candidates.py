@@ -144,11 +144,9 @@ def variants_of(experiment: Experiment, lacking: Collection[str], scales: Callab
 
 def _variants(name: str, log: Scales) -> Iterator[Candidate]:
     """An effect at all values tried of the numbers that its torque is not proportional to."""
-    roles = EFFECTS[name].roles()
-    leaves = [leaf for leaf, role in roles.items() if role.kind in ("harmonic", "frequency", "shape")]
-    held = {leaf: role.neutral for leaf, role in roles.items() if role.kind == "held"}
-    for values in itertools.product(*(roles[leaf].trials(log) for leaf in leaves)):
-        fixed = held | dict(zip(leaves, values, strict=True))
+    held = EFFECTS[name].neutral("held")
+    for values in _combine_trials(name, log, "harmonic", "frequency", "shape"):
+        fixed = held | values
         if EFFECTS[name].sizes():
             yield _proportional(name, fixed, log)
             continue
@@ -164,16 +162,22 @@ def release(name: str, numbers: Numbers, log: Scales) -> list[Candidate]:
     if EFFECTS[name].list_released(numbers):
         return []
     fixed = {leaf: value for leaf, value in numbers.items() if leaf not in EFFECTS[name].sizes()}
-    trials = {leaf: role.trials(log) for leaf, role in EFFECTS[name].roles().items() if role.kind == "held"}
-    finer = [fixed | dict(zip(trials, values, strict=True)) for values in itertools.product(*trials.values())]
+    finer = [fixed | values for values in _combine_trials(name, log, "held")]
     return [_proportional(name, law, log) for law in finer if EFFECTS[name].list_released(law)]
+
+
+def _combine_trials(name: str, log: Scales, *kinds: str) -> Iterator[Numbers]:
+    """Yield all combinations of the trial values of an effect's numbers of some kinds."""
+    trials = {leaf: role.trials(log) for leaf, role in EFFECTS[name].roles(*kinds).items()}
+    for values in itertools.product(*trials.values()):
+        yield dict(zip(trials, values, strict=True))
 
 
 def _proportional(name: str, fixed: Numbers, log: Scales) -> Candidate:
     """An effect with sizes: a column for each direction of them, two a quarter turn apart where its phase is not known."""
     cls = EFFECTS[name]
     roles, directions = cls.roles(), cls.directions()
-    phase = next((leaf for leaf, role in roles.items() if role.kind == "angle"), None)
+    phase = next(iter(cls.roles("angle")), None)
     effects, sizes = [], []
     for direction in directions:
         (size,) = {float(next(iter(roles[leaf].trials(log)))) for leaf in direction}

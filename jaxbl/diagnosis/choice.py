@@ -17,10 +17,10 @@ from .blocks import standard_errors_better
 from .confidence import Finding, missing_power, weigh
 from .effect_search import EffectSearch, Explanation, Trial, VerdictName
 from .expected_errors import expected_errors, list_failed
-from .fitted_model import FittedModel
 from .history import Step
 from .neutral_effects import candidates
 from .reference_log import Comparison
+from .refit import FittedModel
 from .residuals import SideResiduals
 from .setup import Setup, doubt_input
 from .thresholds import LIMITS

@@ -1,7 +1,7 @@
 """How sure a finding is: against other effects in its place, against its size, by blocks of the log, and by
 what is held out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,8 @@ from jaxbl.drive.parameters import get_leaf
 
 from .effect_search import Explanation
 from .expected_errors import Expected
-from .fitted_model import FittedModel
 from .reference_log import Errors
+from .refit import FittedModel
 from .thresholds import LIMITS
 
 LEAST_CHANCE = 0.01
@@ -46,47 +46,36 @@ class Finding(NamedTuple):
         """True if one of these is likelier than none."""
         return self.chance > 1.0 - self.chance
 
+    def confirm(self, z: float) -> "Finding":
+        """The finding no surer than held-out data alone make an effect of the same prior odds; `z`: standard errors by which
+        they are predicted better with it."""
+        # nats of a normal number of mean z over one of mean 0
+        part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / max(self.chance, 1e-300))
+        alternatives = tuple((name, part * chance) for name, chance in self.alternatives)
+        return self._replace(confidence=part * self.confidence, alternatives=alternatives)
+
 
 def weigh(explanation: Explanation, left: float = 0.0) -> tuple[Finding, ...]:
     """Weigh the effects that were found; `left`: torque that is still missing, over the driving torque."""
-    return tuple(_weigh(explanation, name, left) for name in explanation.fitted.names)
-
-
-def _weigh(explanation: Explanation, name: str, left: float) -> Finding:
-    fitted, gain = explanation.fitted, explanation.gains[name]
-    odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
-    # what is still unknown may stand in its place, or what laws of other effects miss: odds by the squares of gains, and of
-    # torques, part right from wrong on generated logs
-    parts = [
-        explanation.largest_gain / max(gain.nats, 1.0),
-        left / max(fitted.share(name), 1e-300),
-        fitted.missed_share(name) / max(fitted.own_share(name), 1e-300),
-    ]
-    unknown = max(parts) ** 2
-    odds |= {trial.added[0]: explanation.odds_of(trial) for trial in explanation.plainer[name] if trial.added[0] != name}
-    total = 1.0 + sum(odds.values()) + unknown
-    # no surer than that its torque is not zero, nor than that it makes the model better by blocks
-    least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
-    weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
-    alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
-    return Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives)
-
-
-def confirm(findings: Sequence[Finding], holdout_z: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Findings no surer than held-out data alone make an effect of the same prior odds.
-
-    Args:
-        findings: by the log.
-        holdout_z: standard errors by which each effect that acts there makes the model predict held-out data better.
-    """
-    return tuple(_confirm(finding, holdout_z.get(finding.effect, np.inf)) for finding in findings)
-
-
-def _confirm(finding: Finding, z: float) -> Finding:
-    # nats of a normal number of mean z over one of mean 0
-    part = min(1.0, float(expit(LIMITS.effect_odds + 0.5 * z * abs(z))) / max(finding.chance, 1e-300))
-    alternatives = tuple((name, part * chance) for name, chance in finding.alternatives)
-    return finding._replace(confidence=part * finding.confidence, alternatives=alternatives)
+    fitted, findings = explanation.fitted, []
+    for name, gain in explanation.gains.items():
+        odds = {trial.added[0]: float(np.exp(-trial.gain.worth)) for trial in explanation.rivals[name]}
+        # what is still unknown may stand in its place, or what laws of other effects miss: odds by the squares of gains, and
+        # of torques, part right from wrong on generated logs
+        parts = [
+            explanation.largest_gain / max(gain.nats, 1.0),
+            left / max(fitted.share(name), 1e-300),
+            fitted.missed_share(name) / max(fitted.own_share(name), 1e-300),
+        ]
+        unknown = max(parts) ** 2
+        odds |= {trial.added[0]: explanation.odds_of(trial) for trial in explanation.plainer[name] if trial.added[0] != name}
+        total = 1.0 + sum(odds.values()) + unknown
+        # no surer than that its torque is not zero, nor than that it makes the model better by blocks
+        least = min(_certainty(fitted, name), float(ndtr(gain.standard_errors)))
+        weighed = sorted(((other, chance / total) for other, chance in odds.items()), key=lambda pair: -pair[1])
+        alternatives = tuple(pair for pair in weighed if pair[1] > LEAST_CHANCE)
+        findings.append(Finding(name, min(1.0 / total, least), fitted.numbers[name], alternatives))
+    return tuple(findings)
 
 
 def _certainty(fitted: FittedModel, name: str) -> float:

@@ -23,7 +23,7 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.workers import Progress, announce, limit_blas_threads, make_stage_counter
 
 from .choice import Choice, Chosen
-from .confidence import confirm, explained_share
+from .confidence import explained_share
 from .coordinates import SideCoordinates, all_coordinates
 from .diagnosis_summary import (
     describe_gap,
@@ -140,12 +140,14 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         tables = choice.tabulate(chosen, lacking_after)
         _, gain_values = gains_for(task.missing, fitted.experiment, setup.recorded)
         values = free_values(setup.free, fitted.theta) | gain_values
-        model = extended_study(task.config, fitted.numbers, values, task.record, tables.effects() if tables else ())
+        model = extended_study(task, fitted.numbers, values, tables.effects() if tables else ())
         done()
         # the model stands; only now what was held out is read
         announce("testing on held-out data")
         proof = prove(setup, chosen)
-        chosen = chosen._replace(findings=confirm(chosen.findings, proof.holdout_z))
+        # of an effect that does not act there nothing is said
+        confirmed = tuple(finding.confirm(proof.holdout_z.get(finding.effect, np.inf)) for finding in chosen.findings)
+        chosen = chosen._replace(findings=confirmed)
         share = explained_share(setup.nominal, proof.before.errors, proof.after.errors, proof.expected)
         apart = contradictions(task, fitted, setup.fitted, chosen.driving)
         judgement = judge(chosen, proof, share, bool(apart))
@@ -177,7 +179,7 @@ def run_diagnosis(task: DiagnosisTask, progress: Progress | None = None) -> Diag
         if tables is not None:
             summary["torque_tables"] = tables.summarise(proof.log, proof.after)
         if chosen.rival is not None:
-            summary["rival"] = rival_tables(task.config, task.record, setup.free, chosen.rival)
+            summary["rival"] = rival_tables(setup, chosen.rival)
         done()
     before, after = missing["missing_before"], missing["missing_after"]
     pairs = {

@@ -24,7 +24,7 @@ from jaxbl.records import POSITION_CHANNELS, Record
 from .candidates import EffectNumbers, are_possible
 from .choice import Chosen
 from .confidence import Finding
-from .diagnosis_task import input_rms
+from .diagnosis_task import DiagnosisTask, input_rms
 from .effect_search import Trial
 from .history import Step, describe_history
 from .judgement import Judgement
@@ -198,15 +198,15 @@ def describe_observers(nominal: Experiment, observed: SideObserved, setup: Setup
 
 
 def extended_study(
-    config: Config, numbers: EffectNumbers, values: Numbers, record: Record, tables: Sequence[JsonObject] = ()
+    task: DiagnosisTask, numbers: EffectNumbers, values: Numbers, tables: Sequence[JsonObject] = ()
 ) -> Config:
-    """The study with effects more, some of them tables of torques, and with these numbers; at the log's period where
-    effects cannot be simulated at its own (a dead time of more samples than a model remembers)."""
-    data = config.to_dict()
-    if not are_possible(numbers, config.run.sample_period):
-        data["run"] = data.get("run", {}) | run_of(config, record)
+    """The study of a task with effects more, some of them tables of torques, and with these numbers; at the log's period
+    where effects cannot be simulated at its own (a dead time of more samples than a model remembers)."""
+    data = task.config.to_dict()
+    if not are_possible(numbers, task.config.run.sample_period):
+        data["run"] = data.get("run", {}) | run_of(task.config, task.record)
     added = [*({"kind": name, **values_of} for name, values_of in numbers.items()), *tables]
-    data["effects"] = with_added(data.get("effects", []), added, lambda effect: effect["kind"])
+    data["effects"] = with_added(data.get("effects", []), added)
     return with_values(read_config(data), values)
 
 
@@ -221,9 +221,9 @@ def find_tie(summary: JsonObject) -> tuple[str, str] | None:
     return next(ties, None)
 
 
-def rival_tables(config: Config, record: Record, free: Sequence[FreeParameter], rival: Trial) -> JsonObject:
+def rival_tables(setup: Setup, rival: Trial) -> JsonObject:
     """The best model with another effect, as tables of a study."""
-    data = extended_study(config, rival.fitted.numbers, free_values(free, rival.fitted.theta), record).to_dict()
+    data = extended_study(setup.task, rival.fitted.numbers, free_values(setup.free, rival.fitted.theta)).to_dict()
     tables = {key: data[key] for key in ("run", "drive", "transmission", "effects") if key in data}
     return {"effect": rival.added[0]} | tables
 

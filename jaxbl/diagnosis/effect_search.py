@@ -35,13 +35,12 @@ from .candidates import (
     variants_of,
 )
 from .evidence import Evidence, Products, evidence_of
-from .fitted_model import FittedModel
 from .free_functions import functions_of
 from .history import Step, describe_change
 from .linearised_model import Linear, Predictor
 from .neutral_effects import candidates, find_corrected
 from .reference_log import Comparison, ReferenceLog
-from .refit import ModelFits
+from .refit import FittedModel, ModelFits
 from .thresholds import LIMITS
 from .torque_regression import SHOWN, TorqueRegression
 
@@ -129,20 +128,14 @@ class Explanation(NamedTuple):
         gains: over the model without an effect, by effect.
         rivals: models with another effect in place of one of these, and what the found one gains over each, by effect.
         plainer: the same with a plain law of it.
-        remainder: gain in evidence (nats) of each free function of time, position or velocity, and its most likely size
-            among those tried, as a share of the driving torque.
+        largest_gain: nats that a free function of time, position or velocity gains at most.
     """
 
     fitted: FittedModel
     gains: dict[str, Gain]
     rivals: dict[str, list[Trial]]
     plainer: dict[str, list[Trial]]
-    remainder: dict[str, tuple[float, float]]
-
-    @property
-    def largest_gain(self) -> float:
-        """Largest gain of the free functions that are large enough for an effect, nats."""
-        return max((gain for gain, share in self.remainder.values() if share > LIMITS.least_torque), default=0.0)
+    largest_gain: float
 
     def odds_of(self, plain: Trial) -> float:
         """Odds of a plain law in place of an effect: by the gain over it; and what parts them may be something unknown."""
@@ -255,17 +248,17 @@ class EffectSearch:
             visited.add(state)
             # in the end every effect is asked for, and of several at once each
             thorough = better is None or len(better.names) > len(current.names) + 1
-            current, gains, plainer = self._reduce(better or current, thorough=thorough)
+            reduced = self._reduce(better or current, thorough=thorough)
+            current = reduced.fitted
             if better is not None:
                 self.check_model(current)
             if better is not None or self._identify(current) not in visited:
                 continue
-            explanation = self._conclude(current, gains, plainer)
-            rivals = explanation.rivals
+            explanation = self._conclude(reduced)
             accepted = [
                 (name, trial)
-                for name in rivals
-                for trial in (*rivals[name], *self._try_laws(current, name))
+                for name, rivals in explanation.rivals.items()
+                for trial in (*rivals, *self._try_laws(current, name))
                 if self.gain(current, trial.fitted).is_accepted
             ]
             name, best = max(accepted, key=lambda pair: -pair[1].gain.nats, default=("", None))
@@ -277,20 +270,21 @@ class EffectSearch:
                 self._tried[other] = [Trial((name,), current, best.gain)]
             current = best.fitted
 
-    def _conclude(self, current: FittedModel, gains: dict[str, Gain], plainer: dict[str, list[Trial]]) -> Explanation:
+    def _conclude(self, reduced: Explanation) -> Explanation:
         """Fit rivals to what was found, and free functions to what remains."""
+        current = reduced.fitted
         rivals = {name: self._rivals(current, name) for name in current.names}
-        return Explanation(current, gains, rivals, plainer, self.remainder(current))
+        return reduced._replace(rivals=rivals, largest_gain=self.find_largest_gain(current))
 
     def leave_out(self, explanation: Explanation, name: str, plain: Trial | None) -> Explanation:
         """Explain a log without an effect that was found, or with a plain law of it, as something unknown is likelier in the
         place of what is left out."""
         current = explanation.fitted
-        less = self._refit(current, _drop_effects(current.numbers, [name])) if plain is None else plain.fitted
+        less = self._exchange(current, name) if plain is None else plain.fitted
         gain = explanation.gains[name] if plain is None else plain.gain
         change = describe_change(current.numbers, less.numbers)
         self._note(change, gain, True, "something unknown is likelier in its place", loss=True)
-        explanation = self._conclude(*self._reduce(less, thorough=True))
+        explanation = self._conclude(self._reduce(less, thorough=True))
         self._note_remainder(explanation)
         return explanation
 
@@ -298,13 +292,15 @@ class EffectSearch:
         """Fit the model as given, with what is known to act and with errors of the recording that are larger than effects
         are, which would stand for them."""
         current = self.fits.fit({}, 0.0 * self.fits.prior)
-        for name in [name for name in self.lacking if name in self.expected or EFFECTS[name].in_log]:
+        for name in self.lacking:
             neutral = _Proposal({name: EFFECTS[name].neutral()})
             if name in self.expected:
                 linear, variants = self._vary(current, [name])
                 ranked = self._rank(linear, current.names, variants, linear.best_predictor)
                 trial = self._try(current, ranked[0] if ranked else neutral)
                 stays, reason = self._is_possible(trial.fitted), "known to act"
+            elif not EFFECTS[name].in_log:
+                continue
             else:
                 trial = self._try(current, neutral)
                 stays = trial.gain.is_accepted and trial.fitted.share(name) > LIMITS.effect_size
@@ -379,7 +375,7 @@ class EffectSearch:
         as_proposed = self.fits.fit({**old, **new}, theta + proposal.change, current, tuple(new), promise)
         fitted = self._simplify(as_proposed)
         staying = [name for name in old if name in fitted.names or any(contains(name, plain) for plain in fitted.names)]
-        before = {_law(name, numbers) for name, numbers in current.numbers.items()}
+        _, before = self._identify(current)
         added = [
             name
             for name, numbers in fitted.numbers.items()
@@ -395,6 +391,11 @@ class EffectSearch:
     def _refit(self, current: FittedModel, numbers: EffectNumbers, *added: str) -> FittedModel:
         """Fit a model with other effects, from the own numbers of one; `added`: those that are new there."""
         return self._simplify(self.fits.fit(numbers, current.theta[: len(self.fits.prior)], current, added))
+
+    def _exchange(self, current: FittedModel, name: str, law: EffectNumbers | None = None, *added: str) -> FittedModel:
+        """Fit a model without one of its effects, or with another law in its place."""
+        others = {other: numbers for other, numbers in current.numbers.items() if other != name}
+        return self._refit(current, {**others, **(law or {})}, *added)
 
     def _simplify(self, fitted: FittedModel) -> FittedModel:
         """Put plain laws in the place of effects that are no more than these beside the others; take out what is nothing."""
@@ -417,57 +418,48 @@ class EffectSearch:
             if plain == name or (plain in self.lacking and plain not in fitted.names):
                 yield {plain: law}
 
-    def _reduce(
-        self, current: FittedModel, *, thorough: bool
-    ) -> tuple[FittedModel, dict[str, Gain], dict[str, list[Trial]]]:
-        """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these.
+    def _reduce(self, current: FittedModel, *, thorough: bool) -> Explanation:
+        """Take effects out of a model that gain nothing beside the others or, with special cases in their place, over these;
+        and hold its numbers to what is stated of them, if they gain nothing by being further off.
 
         Returns:
-            The model, what each effect gains, and the special cases of each; unless `thorough`, only these are tried.
+            The model, what each effect gains, and the special cases of each; unless `thorough`, only these are tried. No
+            rivals, and nothing that remains.
         """
         while True:
-            gains, plainer = dict[str, Gain](), dict[str, list[Trial]]()
+            gains, plainer, fewer = dict[str, Gain](), dict[str, list[Trial]](), None
             for name in current.names:
-                certain = name in self.expected
-                plainer[name] = [] if certain else self._try_plainer(current, name)
-                fewer = next((trial.fitted for trial in plainer[name] if not trial.gain.is_accepted), None)
+                certain, plainer[name] = name in self.expected, []
+                for law in () if certain else self._plain_laws(current, name):
+                    trial = self._ask_for(current, self._exchange(current, name, law), [*law])
+                    plainer[name].append(trial)
+                    if not trial.gain.is_accepted:
+                        fewer = trial.fitted
+                        break
                 if fewer is None and thorough:
-                    less = self._refit(current, _drop_effects(current.numbers, [name]))
-                    gains[name] = self.gain(less, current)
-                    stays = certain or gains[name].is_accepted
-                    change = describe_change(current.numbers, less.numbers)
-                    self._note(change, gains[name], not stays, gains[name].rule, loss=True)
-                    fewer = None if stays else less
+                    trial = self._ask_for(current, self._exchange(current, name), certain=certain)
+                    gains[name] = trial.gain
+                    fewer = None if certain or trial.gain.is_accepted else trial.fitted
                 if fewer is not None:
-                    current = fewer
                     break
-            else:
-                less = self._as_stated(current) if thorough and self.fits is self.rough else None
-                if less is None:
-                    return current, gains, plainer
-                current = less
+            if fewer is None and thorough and self.fits is self.rough:
+                less = self.stated.fit(current.numbers, 0.0 * self.stated.prior, current)
+                trial = self._ask_for(current, less, change="hold the numbers to what is stated")
+                if not trial.gain.is_accepted:
+                    self.fits, fewer = self.stated, less
+            if fewer is None:
+                return Explanation(current, gains, {}, plainer, 0.0)
+            current = fewer
 
-    def _as_stated(self, current: FittedModel) -> FittedModel | None:
-        """Hold numbers to what is stated of them, if they gain nothing by being further off."""
-        less = self.stated.fit(current.numbers, 0.0 * self.stated.prior, current)
+    def _ask_for(
+        self, current: FittedModel, less: FittedModel, law: Sequence[str] = (), change: str = "", *, certain: bool = False
+    ) -> Trial:
+        """Ask whether a model gains over one with less, or with a plain `law`, which is to take its place if it does not;
+        `certain`: whether it stays anyway."""
         gain = self.gain(less, current)
-        self._note("hold the numbers to what is stated", gain, not gain.is_accepted, gain.rule, loss=True)
-        if gain.is_accepted:
-            return None
-        self.fits = self.stated
-        return less
-
-    def _try_plainer(self, current: FittedModel, name: str) -> list[Trial]:
-        """Put special cases of an effect in its place, up to one over which it gains nothing."""
-        trials = list[Trial]()
-        for law in self._plain_laws(current, name):
-            less = self._refit(current, {**_drop_effects(current.numbers, [name]), **law})
-            gain = self.gain(less, current)
-            self._note(describe_change(current.numbers, less.numbers), gain, not gain.is_accepted, gain.rule, loss=True)
-            trials.append(Trial((*law,), less, gain))
-            if not gain.is_accepted:
-                break
-        return trials
+        change = change or describe_change(current.numbers, less.numbers)
+        self._note(change, gain, not (certain or gain.is_accepted), gain.rule, loss=True)
+        return Trial(tuple(law), less, gain)
 
     def _rivals(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit models with another effect in place of one, of the best that were accepted in its round."""
@@ -476,10 +468,9 @@ class EffectSearch:
             (other, *more) = trial.added
             if more or other in current.names or contains(other, name) or contains(name, other):
                 continue
-            numbers = _drop_effects(current.numbers, [name])
-            if any(replaces(effect, other) or replaces(other, effect) for effect in numbers):
+            if any(replaces(effect, other) or replaces(other, effect) for effect in current.names if effect != name):
                 continue
-            fitted = self._refit(current, {**numbers, other: trial.fitted.numbers[other]}, other)
+            fitted = self._exchange(current, name, {other: trial.fitted.numbers[other]}, other)
             gain = self.gain(fitted, current)
             reason = f"{name if gain.is_accepted else 'neither'} is better by the same rule"
             self._note(f"replace {name} by {other}", gain, False, reason, loss=True)
@@ -490,7 +481,7 @@ class EffectSearch:
     def _try_laws(self, current: FittedModel, name: str) -> list[Trial]:
         """Fit a model with the likeliest other waves of an effect, if it has any, as a fit leaves whole numbers as they are,
         and with finer laws of a memory in its place: no screening along a predictor's path foresees how they change it."""
-        waves = {leaf: current.numbers[name][leaf] for leaf in _waves(name)}
+        waves = {leaf: current.numbers[name][leaf] for leaf in EFFECTS[name].roles("harmonic")}
         with_memory = [law for law in self.lacking if EFFECTS[law].advance is not AbstractEffect.advance]
         laws = [law for law in with_memory if law != name and is_finer_law(law) and replaces(law, name)]
         if not (waves or laws):
@@ -574,7 +565,7 @@ class EffectSearch:
         if not variants or not np.isfinite(predictor.deviation).all():
             # nothing to rank, or no predictor follows this model
             return []
-        alone, *models = linear.products(variants, predictor.smoothness, predictor.deviation)
+        alone, *models = linear.products(variants, predictor)
         base = evidence_of(alone)
         assert base is not None
         best: dict[str, _Proposal] = {}
@@ -596,12 +587,12 @@ class EffectSearch:
         explained = 0.5 * errors * float(np.log(max(base.misfit, 1e-300) / max(evidence.misfit, 1e-300)))
         return evidence.log_evidence - base.log_evidence + 0.5 * (evidence.misfit - base.misfit) + explained
 
-    def remainder(self, fitted: FittedModel) -> dict[str, tuple[float, float]]:
-        """Find what free functions gain beside a model (nats), and their size over the driving torque, by name."""
+    def find_largest_gain(self, fitted: FittedModel) -> float:
+        """Find what a free function gains at most beside a model, nats, of those that are large enough for an effect at the
+        most likely size of those tried."""
         linear = fitted.linear
-        functions, predictor, gained = functions_of(linear.signals), linear.best_predictor, {}
-        alone, *models = linear.products(functions, predictor.smoothness, predictor.deviation)
-        none = evidence_of(alone)
+        alone, *models = linear.products(functions_of(linear.signals), linear.best_predictor)
+        none, gains = evidence_of(alone), []
         for columns in models:
             best = (-np.inf, 0.0)
             for size in _SIZES:
@@ -612,23 +603,14 @@ class EffectSearch:
                 if none is not None and with_function is not None:
                     nats = self._nats(linear, none, with_function)
                     best = max(best, (nats - min(max(nats, 0.0), self.floor), size * LIMITS.effect_size))
-            gained[columns.candidate.name] = best
-        return gained
-
-
-def _drop_effects(numbers: EffectNumbers, names: Collection[str]) -> EffectNumbers:
-    """Leave out the numbers of some effects."""
-    return {name: values for name, values in numbers.items() if name not in names}
+            if best[1] > LIMITS.least_torque:
+                gains.append(best[0])
+        return max(gains, default=0.0)
 
 
 def _law(name: str, numbers: Numbers) -> tuple:
     """Identify the law of an effect: its name, its waves, and what it does not hold."""
-    return name, *(numbers[leaf] for leaf in _waves(name)), *EFFECTS[name].list_released(numbers)
-
-
-def _waves(name: str) -> list[str]:
-    """List the numbers of an effect that are whole, which a fit leaves as they are."""
-    return [leaf for leaf, role in EFFECTS[name].roles().items() if role.kind == "harmonic"]
+    return name, *(numbers[leaf] for leaf in EFFECTS[name].roles("harmonic")), *EFFECTS[name].list_released(numbers)
 
 
 def _without(columns: Products, linear: Linear, names: Collection[str]) -> Products:

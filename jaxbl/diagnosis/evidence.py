@@ -78,11 +78,23 @@ def _evidence(c: Products, width: int) -> Evidence | None:
         variance[of] += factor**2 * variance[k]
         middle[of] += factor * middle[k]
     chosen = np.array([k for k in alive if k not in joined], int)
-    solved = _solve(c.products, chosen, fixed, np.sqrt(variance[chosen]), middle[chosen])
-    if solved is None:
+    # coefficients of these, with their prior, beside the fixed columns, whose coefficient is 1
+    spread, centre = np.sqrt(variance[chosen]), middle[chosen]
+    precision = spread**-2.0
+    matrix = c.products[np.ix_(chosen, chosen)] + np.diag(precision)
+    towards = c.products[np.ix_(chosen, fixed)].sum(axis=1) - precision * centre
+    total = c.products[np.ix_(fixed, fixed)].sum() + float(precision @ centre**2)
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    with np.errstate(over="ignore"):
+        root = _root(matrix / np.outer(size, size))
+    if root is None:
         return None
+    inside = solve_triangular(root, towards / size, lower=True)
     values = np.zeros(len(c.scale))
-    values[chosen], log_evidence, misfit = solved
+    values[chosen] = -solve_triangular(root, inside, lower=True, trans=1) / size
+    determinant = 2.0 * float(np.sum(np.log(np.diag(root)) + np.log(size) + np.log(spread)))
+    cost = total - float(inside @ inside)
+    misfit = cost - float(np.sum(((values[chosen] - centre) / spread) ** 2))
     # the sum's distance from its mean is shared out by the variances
     away = values - middle
     for k in joined:
@@ -90,28 +102,7 @@ def _evidence(c: Products, width: int) -> Evidence | None:
         values[k] = c.centre[k] + factor * c.scale[k] ** 2 / variance[of] * away[of]
         values[of] -= factor * values[k]
     numbers = c.candidate.numbers(values[c.shared_count : c.shared_count + c.candidate.width].tolist())
-    return None if numbers is None else Evidence(log_evidence, misfit, numbers, values[1 : c.shared_count])
-
-
-def _solve(
-    products: np.ndarray, chosen: np.ndarray, fixed: np.ndarray, spread: np.ndarray, centre: np.ndarray
-) -> tuple[np.ndarray, float, float] | None:
-    """Find the coefficients of chosen columns, with a prior, beside columns whose coefficient is 1; log-evidence, and
-    misfit."""
-    precision = spread**-2.0
-    matrix = products[np.ix_(chosen, chosen)] + np.diag(precision)
-    towards = products[np.ix_(chosen, fixed)].sum(axis=1) - precision * centre
-    total = products[np.ix_(fixed, fixed)].sum() + float(precision @ centre**2)
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    with np.errstate(over="ignore"):
-        root = _root(matrix / np.outer(size, size))
-    if root is None:
-        return None
-    inside = solve_triangular(root, towards / size, lower=True)
-    coefficients = -solve_triangular(root, inside, lower=True, trans=1) / size
-    determinant = 2.0 * float(np.sum(np.log(np.diag(root)) + np.log(size) + np.log(spread)))
-    cost = total - float(inside @ inside)
-    return coefficients, -0.5 * (cost + determinant), cost - float(np.sum(((coefficients - centre) / spread) ** 2))
+    return None if numbers is None else Evidence(-0.5 * (cost + determinant), misfit, numbers, values[1 : c.shared_count])
 
 
 def _root(unit: np.ndarray) -> np.ndarray | None:

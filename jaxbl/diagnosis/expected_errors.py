@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from .fitted_model import FittedModel
 from .reference_log import Comparison, Errors, ReferenceLog
+from .refit import FittedModel
 from .setup import InputNoise, quiet
 from .thresholds import LIMITS
 

@@ -65,7 +65,12 @@ def input_jumps(torque: np.ndarray, noise: float) -> list[int]:
 def _smooth_curve(values: np.ndarray) -> np.ndarray:
     """The smooth curve that generalised cross-validation chooses."""
     count = len(values)
-    penalty = _penalty(count)
+    # products of third differences, as lower bands
+    stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
+    penalty = np.zeros((_ORDER + 1, count))
+    for apart in range(_ORDER + 1):
+        products = stencil[apart:] * stencil[: len(stencil) - apart]
+        penalty[apart, : count - apart] = np.convolve(np.ones(count - _ORDER), products)
     frequency = np.linspace(0.0, np.pi, 4096)
     best, least = values, np.inf
     for cutoff in _CUTOFFS:
@@ -79,13 +84,3 @@ def _smooth_curve(values: np.ndarray) -> np.ndarray:
         if score < least:
             best, least = curve, score
     return best
-
-
-def _penalty(count: int) -> np.ndarray:
-    """Products of third differences, as lower bands."""
-    stencil = np.diff(np.eye(_ORDER + 1), n=_ORDER, axis=0)[0]
-    bands = np.zeros((_ORDER + 1, count))
-    for apart in range(_ORDER + 1):
-        products = stencil[apart:] * stencil[: len(stencil) - apart]
-        bands[apart, : count - apart] = np.convolve(np.ones(count - _ORDER), products)
-    return bands

@@ -180,7 +180,7 @@ _NO_INPUT = 1e-3
 """Input over the torque that the motion takes, rms, below which the drive moves freely."""
 DIVERGED = 1e30
 """Products of prediction errors, over their variance or in rad^2, from which on a model diverges: squares soon overflow."""
-SILENT = 1e-20
+_SILENT = 1e-20
 """Influence of an initial state over that of others, squared, below which it has none (the state of a neutral effect):
 rounding is 1e-16."""
 _ALIKE = 1e-12
@@ -219,17 +219,14 @@ class Predictor:
         prior, centre = np.full(width, np.inf), np.zeros(width)
         prior[:own_count], centre[:own_count] = self.prior, -self.theta
         for turn in range(2):
-            weighted = [np.einsum("s,scd->cd", weight, gram) for gram in grams]
-            responses = [_response_and_loss(gram, states) for gram in weighted]
-            total = np.sum(
-                [_without(gram, states, response) for gram, (response, _) in zip(weighted, responses, strict=True)], axis=0
-            )
+            eliminated = [_eliminate(np.einsum("s,scd->cd", weight, gram), states) for gram in grams]
+            total = np.sum([rest for rest, _, _ in eliminated], axis=0)
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
-            lost = sum(loss for _, loss in responses) / variance
+            lost = sum(loss for _, _, loss in eliminated) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:
                 return
             free = np.concatenate([[1.0], _least_squares(total, variance / prior**2, centre)])
-            coefficients = [np.concatenate([free, -response @ free]) for response, _ in responses]
+            coefficients = [np.concatenate([free, -response @ free]) for _, response, _ in eliminated]
             left = [np.einsum("c,scd,d->s", vector, gram, vector) for vector, gram in zip(coefficients, grams, strict=True)]
             squares = np.sum(left, axis=0)
             if not (squares > 0.0).all():
@@ -304,14 +301,18 @@ class Linear:
 
     def scales(self, name: str) -> Scales:
         """Measure how large things are on the record, as an effect sees them; frequencies and waves only if it has some."""
-        place = self.experiment.drive.resolve_place(name.partition(".")[0])
-        scales, kinds = self._scales_at(place), {role.kind for role in EFFECTS[name].roles().values()}
-        if "frequency" in kinds and not scales.frequencies:
+        place, roles = self._place_of(name), EFFECTS[name].roles
+        scales = self._scales_at(place)
+        if roles("frequency") and not scales.frequencies:
             scales = scales._replace(frequencies=tuple(self.frequencies(place)))
-        if "harmonic" in kinds and place in self.sides and not scales.waves:
+        if roles("harmonic") and place in self.sides and not scales.waves:
             scales = scales._replace(waves=tuple(self.waves(place)))
         self._scales[place] = scales
         return scales
+
+    def _place_of(self, name: str) -> str:
+        """Return where an effect of a full name acts."""
+        return self.experiment.drive.resolve_place(name.partition(".")[0])
 
     def _scales_at(self, place: str) -> Scales:
         if place in self._scales:
@@ -328,6 +329,11 @@ class Linear:
         ratio, twist = float(self.experiment.drive.ratio("load")), np.zeros(1)
         if len(self.sides) == 2:
             twist = join(lambda part: part.position["motor"] - ratio * part.position["load"])
+        harmonics: list[float] = []
+        for effect in self.experiment.effects:
+            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf in effect.sizes())
+            if acts and self.experiment.drive.resolve_place(effect.place) == side:
+                harmonics += [float(getattr(effect, leaf)) for leaf in effect.roles("harmonic")]
         self._scales[place] = Scales(
             torque=float(np.max(np.abs(join(lambda part: part.torque)))),
             period=self.period,
@@ -339,20 +345,10 @@ class Linear:
             travel=float(np.ptp(position)),
             noise=self._noise[side],
             ratio=ratio,
-            harmonics=self._harmonics(side),
+            harmonics=tuple(harmonics),
             wave_count=int(np.clip(0.5 * np.pi / max(slow * self.period, 1e-9), 1, _MOST_WAVES)),
         )
         return self._scales[place]
-
-    def _harmonics(self, side: str) -> tuple[float, ...]:
-        """Periods a turn of the waves that effects on a side have."""
-        harmonics: list[float] = []
-        for effect in self.experiment.effects:
-            roles = type(effect).roles()
-            acts = any(float(getattr(effect, leaf)) != 0.0 for leaf in effect.sizes())
-            if acts and self.experiment.drive.resolve_place(effect.place) == side:
-                harmonics += [float(getattr(effect, leaf)) for leaf, role in roles.items() if role.kind == "harmonic"]
-        return tuple(harmonics)
 
     def choices(self, name: str) -> float:
         """Logarithm of the number of values that an effect was sought with, where each could be told from the next."""
@@ -361,8 +357,8 @@ class Linear:
             if role.kind == "frequency":
                 count *= max(self.count * self.period * self._highest, 1.0)
             elif role.kind == "harmonic":
-                log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
-                count *= max(len(role.trials(log)) if role.trial_count is None else role.trial_count(log), 1)
+                log = self._scales_at(self._place_of(name))
+                count *= max(log.wave_count if role.among_waves else len(role.trials(log)), 1)
         return float(np.log(count))
 
     @property
@@ -448,19 +444,19 @@ class Linear:
         parts = self.errors(smoothness), self.predictor(smoothness).coefficients
         return [errors @ coefficients for errors, coefficients in zip(*parts, strict=True)]
 
-    def products(self, variants: Sequence[Candidate], smoothness: Sequence[float], noise: np.ndarray) -> list[Products]:
-        """Products of everything that the prediction errors are linear in, initial states eliminated: of the model alone,
-        and then with each candidate; `noise`: rms of the errors by side, rad."""
-        gain, groups = find_gains(smoothness, self.period), _groups([NO_CANDIDATE, *variants])
+    def products(self, variants: Sequence[Candidate], predictor: Predictor) -> list[Products]:
+        """Products of everything that the prediction errors under a predictor's gain are linear in, over what it leaves of
+        them, initial states eliminated: of the model alone, and then with each candidate."""
+        gain, groups = find_gains(predictor.smoothness, self.period), _groups([NO_CANDIDATE, *variants])
         forces_of_all = [[Forces(columns_of(group, signals)) for signals in self.signals] for group in groups]
 
         def multiply(forces: list[Forces]) -> tuple[np.ndarray, np.ndarray]:
             grams = [
-                np.einsum("s,scd->cd", noise**-2.0, steps.grams([gain], force)[0])
+                np.einsum("s,scd->cd", predictor.deviation**-2.0, steps.grams([gain], force)[0])
                 for steps, force in zip(self.steps, forces, strict=True)
             ]
             power = np.sum([self._power(force) for force in forces], axis=0)
-            return np.sum([_eliminate(gram, self.states) for gram in grams], axis=0), power
+            return np.sum([_eliminate(gram, self.states)[0] for gram in grams], axis=0), power
 
         # the constant and the own numbers come first
         shared, models = 1 + len(self.free), list[Products]()
@@ -502,13 +498,13 @@ class Linear:
             return np.inf
         # the torque of the input once more
         again = Candidate("input", 1, (), lambda signals, _: {-1: signals.part.torque[None, : signals.samples]})
-        _, with_input = self.products([again], self.best_predictor.smoothness, self.best_predictor.deviation)
+        _, with_input = self.products([again], self.best_predictor)
         return float(np.sqrt(with_input.products[-1, -1]))
 
     def shows(self, name: str, numbers: Numbers) -> bool:
         """Tell whether the log can show an effect with these numbers: a gap three times as wide as any twist, or contacts
         that bend over a third of the motion, would look like another effect."""
-        log = self._scales_at(self.experiment.drive.resolve_place(name.partition(".")[0]))
+        log = self._scales_at(self._place_of(name))
         return all(
             numbers[leaf] <= np.exp(REACH) * max(role.trials(log), default=np.inf)
             for leaf, role in EFFECTS[name].roles().items()
@@ -578,33 +574,32 @@ def _as_it_stands(grams: np.ndarray, states: int) -> np.ndarray:
     total = np.einsum("s,scd->cd", weight, grams)
     vector = np.zeros(total.shape[0])
     vector[0] = 1.0
-    vector[-states:] = -_response_and_loss(total, states)[0][:, 0]
+    vector[-states:] = -_eliminate(total, states)[1][:, 0]
     return np.einsum("c,scd,d->s", vector, grams, vector)
 
 
-def _response_and_loss(gram: np.ndarray, states: int) -> tuple[np.ndarray, float]:
-    """Find what the initial states, which may be all but alike, take off the other columns; and what rounding may take off
-    the square of the first column with it."""
-    inner = gram[-states:, -states:]
-    if not np.isfinite(inner).all():  # of a model that diverges
-        return np.zeros_like(gram[-states:, :-states]), 0.0
+def _eliminate(gram: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Take the initial states, the last columns, which may be all but alike, off the others.
+
+    Returns:
+        Products of the others without what the states explain, coefficients of the states for each of the others, and what
+        rounding may take off the square of the first column.
+    """
+    inner, across, lost = gram[-states:, -states:], gram[-states:, :-states], 0.0
+    # of a model that diverges
+    if not np.isfinite(inner).all():
+        response = np.zeros_like(across)
+        return gram[:-states, :-states] - gram[:-states, -states:] @ response, response, lost
     # infinite where a state does nothing
     size = np.sqrt(np.maximum(np.diag(inner), 0.0))
-    size = np.where(size > SILENT * np.max(size), size, np.inf)
+    size = np.where(size > _SILENT * np.max(size), size, np.inf)
     values, vectors = np.linalg.eigh(inner / np.outer(size, size))
     largest = np.max(np.abs(values))
     significant = np.abs(values) > _ALIKE * largest
     inverse = (vectors * np.where(significant, 1.0 / np.where(significant, values, 1.0), 0.0)) @ vectors.T
-    response = (inverse @ (gram[-states:, :-states] / size[:, None])) / size[:, None]
+    response = (inverse @ (across / size[:, None])) / size[:, None]
     # a state without influence has a zero of its own among these
     least = np.sort(np.abs(values))[np.sum(~np.isfinite(size))] if np.isfinite(size).any() else largest
-    return response, float(np.finfo(float).eps * gram[0, 0] / max(least / largest, SILENT)) if largest > 0.0 else 0.0
-
-
-def _without(gram: np.ndarray, states: int, response: np.ndarray) -> np.ndarray:
-    return gram[:-states, :-states] - gram[:-states, -states:] @ response
-
-
-def _eliminate(gram: np.ndarray, states: int) -> np.ndarray:
-    """Products of columns without what the last of them, the initial states, explain."""
-    return _without(gram, states, _response_and_loss(gram, states)[0])
+    if largest > 0.0:
+        lost = float(np.finfo(float).eps * gram[0, 0] / max(least / largest, _SILENT))
+    return gram[:-states, :-states] - gram[:-states, -states:] @ response, response, lost

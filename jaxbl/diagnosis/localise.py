@@ -221,18 +221,16 @@ def locate(
     longest = int(np.argmax([len(residual.time) for residual in residuals]))
     peaks = _find_peaks(residuals[longest], coordinates[longest]["speed"].values, float(np.sqrt(excess / joined.count)))
     missing = float(np.sqrt(max(power - noise, 0.0) / joined.count))
-    beyond = (
-        (z > LIMITS.significant and missing > floor)
-        or any(
-            (abs(region.mean_z) > LIMITS.significant and abs(region.mean) > floor)
-            or (region.excess_z > LIMITS.significant and region.excess > floor**2)
-            for coordinate in over.values()
-            for region in coordinate.regions
-        )
-        or any(peak.excess_z > LIMITS.significant and peak.amplitude > floor for peak in peaks)
-    )
+    regions = [region for coordinate in over.values() for region in coordinate.regions]
+    torques = [
+        (z, missing),
+        *((abs(region.mean_z), abs(region.mean)) for region in regions),
+        *((region.excess_z, max(region.excess, 0.0) ** 0.5) for region in regions),
+        *((peak.excess_z, peak.amplitude) for peak in peaks),
+    ]
+    beyond = any(significance > LIMITS.significant and torque > floor for significance, torque in torques)
     return Localised(
-        residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(noise / joined.count)), missing, z, bool(beyond), over,
+        residuals[0].name, joined.parts[0].bandwidth, float(np.sqrt(noise / joined.count)), missing, z, beyond, over,
         peaks,
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ from scipy.special import expit
 from jaxbl.chain import Experiment, with_effects
 from jaxbl.config import Config
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, Numbers, make_effect
-from jaxbl.drive.parameters import as_arrays, parameters, units_of
+from jaxbl.drive.parameters import as_arrays, units_of
 from jaxbl.estimation.free_parameters import FreeParameter, make_free_parameters
 from jaxbl.estimation.logs import default_paths, on_record
 from jaxbl.estimation.motor_alone import Alone, alone_of, alone_on_holdout, columns_alone, gap_summary, search_gap
@@ -87,12 +87,12 @@ def list_sought(experiment: Experiment, exact: Collection[str] = ()) -> list[str
     `exact`: names of effects that are surely not missing.
     """
     names = []
-    taken = {(type(effect).exclusive, effect.place) for effect in experiment.effects}
+    taken = {(effect.exclusive, effect.place) for effect in experiment.effects}
     for name in candidates(experiment):
         if name in exact:
             continue
         cls, place = EFFECTS[name], name.partition(".")[0]
-        numbers = [parameter.role.kind for _, parameter in parameters(cls) if parameter.role is not None]
+        numbers = [role.kind for role in cls.roles().values()]
         play = cls.free_play is not AbstractEffect.free_play and cls.suits(experiment.transmission)
         dry = cls.dry_friction is not AbstractEffect.dry_friction and numbers == ["size"]
         if play or (dry and place in ("motor", "load") and (cls.exclusive, place) not in taken):
@@ -110,7 +110,7 @@ def _set_up(task: DiagnosisTask) -> _Search:
         for name in names
     }
     added = [as_arrays(make_effect(name, **numbers), float) for name, numbers in first.items()]
-    model = with_effects(bare, tuple(with_added(bare.effects, added, lambda effect: effect.name)))
+    model = with_effects(bare, tuple(with_added(bare.effects, added)))
     own_paths = default_paths(config, bare)
     paths = [f"effects.{name}.{next(iter(numbers))}" for name, numbers in first.items()]
     at_rest = config.log.initial_state == "rest"
@@ -141,7 +141,25 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     history: list[Step] = []
     # a gap of its own stays as free as it is
     out, point = ([], gap.best) if gap is not None and (gap.is_needed or not search.play) else (search.play, point)
-    point, gains = _drop_needless(search, point, out, history)
+    # frictions without which the log is met as well go one after the other
+    while True:
+        frictions = [name for name in search.effects if name not in (*out, *search.play)]
+        points = {name: search.finish(point, [*out, name]) for name in frictions}
+        inflation, gains = search.without(out).spread(point).inflation, dict[str, float]()
+        # minus twice the log-likelihood by which a friction makes the fit better, correlation of the errors counted; without
+        # the prior of its level: none at all is far from any level that a fit begins with
+        for name, less in points.items():
+            i = search.effects[name]
+            prior = (less.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
+            gains[name] = float((less.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
+        least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
+        needless = None if least is None or gains[least] >= SHOWN else least
+        for name, gain in gains.items():
+            history.append(Step(f"remove {name}", -0.5 * gain, None, name == needless, f"{0.5 * SHOWN:g} nats are asked"))
+        if needless is None:
+            break
+        out.append(needless)
+        point = points[needless]
     gains |= {name: gap.gain for name in search.play if gap is not None}
     model = search.without(out)
     alone = alone_of(search.model, *model.settle(point), model.held, gap, np.e, task.record)
@@ -153,33 +171,9 @@ def diagnose_alone(task: DiagnosisTask, done: Callable[[], None]) -> tuple[Confi
     numbers = {name: {path.rpartition(".")[2]: alone.values[path]} for name, path in paths.items()}
     summary = _summary(task, held_out, search, alone, gains, numbers) | {"history": describe_history(history)}
     numbers_of_model = {number.path: alone.values[number.path] for number in search.free}
-    study = extended_study(task.config, numbers, numbers_of_model, task.record)
+    study = extended_study(task, numbers, numbers_of_model)
     done()
     return study, held_out, summary, pd.DataFrame(columns_alone(task.record, alone))
-
-
-def _drop_needless(search: _Search, point: Point, out: list[str], history: list[Step]) -> tuple[Point, Numbers]:
-    """The fit without the frictions that are not needed, which are added to `out`, and what each other one gains; what is
-    tried goes into the history."""
-    while True:
-        frictions = [name for name in search.effects if name not in (*out, *search.play)]
-        points = {name: search.finish(point, [*out, name]) for name in frictions}
-        inflation, gains = search.without(out).spread(point).inflation, {}
-        # minus twice the log-likelihood by which a friction makes the fit better, correlation of the errors counted; without
-        # the prior of its level: none at all is far from any level that a fit begins with
-        for name, less in points.items():
-            i = search.effects[name]
-            prior = (less.theta[i] ** 2 - point.theta[i] ** 2) / search.model.width[i] ** 2
-            gains[name] = float((less.deviance - point.deviance - prior) / max(inflation[i] ** 2, 1.0))
-        least = min(gains.keys() - {*search.expected}, key=lambda name: gains[name], default=None)
-        needless = least is not None and not gains[least] >= SHOWN
-        for name, gain in gains.items():
-            reason = f"{0.5 * SHOWN:g} nats are asked"
-            history.append(Step(f"remove {name}", -0.5 * gain, None, needless and name == least, reason))
-        if least is None or not needless:
-            return point, gains
-        out.append(least)
-        point = points[least]
 
 
 def _summary(
@@ -188,9 +182,8 @@ def _summary(
     """Make `diagnosis.json`, but for the history; `numbers` of the effects that are left."""
     record, model, values = task.record, search.model, alone.values
     noise, unit = model.noise, record.unit_of("motor.position", "rad")
-    deviation = np.sqrt(np.diag(alone.search_fit.spread.covariance))
-    errors = dict.fromkeys(values, float("nan"))
-    errors |= {number.path: values[number.path] * deviation[i] for i, number in enumerate(alone.search_fit.free)}
+    deviations, errors = alone.search_fit.spread.deviations, dict.fromkeys(values, float("nan"))
+    errors |= {number.path: values[number.path] * deviations[i] for i, number in enumerate(alone.search_fit.free)}
     holdout = alone_on_holdout(held_out, alone, search.none)["position"]["motor"]
     limit = (1.0 + _NOISE_ERROR) * max(alone.point.variance**0.5, noise)
     left, size = model.measure_unexplained(alone.point), input_rms(record)

@@ -6,9 +6,9 @@ where it acts. Loops for this machine's processor, which compile fast, get the m
 """
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from functools import cache, lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,8 +17,6 @@ from jaxbl.chain import Experiment, with_effects
 from jaxbl.drive.effects import EFFECTS, AbstractEffect, ConstantTorque, make_effect
 from jaxbl.drive.parameters import as_arrays
 from jaxbl.drive.plant import PlantState
-
-Effect = TypeVar("Effect")
 
 
 def candidates(experiment: Experiment) -> list[str]:
@@ -65,7 +63,7 @@ def complete(experiment: Experiment, acting: Collection[str] = ()) -> Experiment
     added = [_neutral(name) for name in candidates(experiment) if name in acting or not has_state(name)]
     if not added:
         return experiment
-    effects = with_added(experiment.effects, added, lambda effect: effect.name)
+    effects = with_added(experiment.effects, added)
     kinds = list(EFFECTS)
     if len({effect.name for effect in effects}) == len(effects):
         # one order whatever was given, so that models share their programs; that of the actuator's matters
@@ -116,12 +114,12 @@ def with_torques(experiment: Experiment) -> tuple[Experiment, dict[str, str]]:
     return with_effects(experiment, (*experiment.effects, *added)), paths
 
 
-def with_added(present: Iterable[Effect], added: Iterable[Effect], name_of: Callable[[Effect], str]) -> list[Effect]:
-    """Effects that a model has, in their order, and others behind them; effects of the actuator before those given of a
-    higher rank (:class:`jaxbl.drive.effects.ActuatorEffect`)."""
+def with_added(present: Iterable[Any], added: Iterable[Any]) -> list[Any]:
+    """Effects that a model has, or a study as tables, in their order, and others behind them; effects of the actuator before
+    those given of a higher rank (:class:`jaxbl.drive.effects.ActuatorEffect`)."""
 
-    def rank(effect: Effect) -> int:
-        return getattr(EFFECTS[name_of(effect)], "rank", -1)
+    def rank(effect: Any) -> int:
+        return getattr(EFFECTS[effect["kind"]] if isinstance(effect, dict) else effect, "rank", -1)
 
     effects = list(present)
     for effect in added:

@@ -125,10 +125,10 @@ def write_gap_experiment(
     if backlash["shown"]:
         return "No gap is in doubt: no experiment is needed to show one, and none was written."
     half, model = float(min(backlash["at_most"], backlash["nominal"] or np.inf)), read_config(folder / "model.toml")
+    assert record.torque is not None
     with jax.enable_x64(True):
-        models = [on_record(config, record) for config in (model, with_gap(model, backlash["path"], half))]
-        assert record.torque is not None
-        experiment = _parting(models, record, torque, travel, float(np.mean(record.torque)))
+        pair = model, with_gap(model, backlash["path"], half)
+        experiment = _find_parting_input(pair, record, torque, travel, float(np.mean(record.torque)))
     aim = f"a half gap of {half:.3g} {record.unit_of('motor.position', 'rad')}"
     if experiment is None:
         return f"No input stays within the torque and travel allowed that would show {aim}: --max-torque, --max-travel."
@@ -141,7 +141,7 @@ def with_gap(model: Config, path: str, half: float) -> Config:
         data = model.to_dict()
         gap = f"transmission.{Backlash.kind}"
         effects = [effect for effect in data.get("effects", []) if effect["kind"] != gap]
-        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}], lambda effect: effect["kind"])
+        data["effects"] = with_added(effects, [{"kind": gap, "half_gap": half}])
         return read_config(data)
     return with_values(model, {path: half / (4.0 if path.endswith("dead_zone") else 1.0)})
 
@@ -179,19 +179,19 @@ def next_experiment(
     data = model.to_dict() | summary["rival"]
     del data["effect"]
     with jax.enable_x64(True):
-        models = [on_record(config, record) for config in (model, read_config(data))]
-        return _parting(models, record, torque, travel)
+        return _find_parting_input((model, read_config(data)), record, torque, travel)
 
 
-def _parting(
-    models: list[Experiment], record: Record, torque: float | None, travel: float | None, bias: float = 0.0
+def _find_parting_input(
+    pair: tuple[Config, Config], record: Record, torque: float | None, travel: float | None, bias: float = 0.0
 ) -> Input | None:
-    """The input on which two models' positions differ most, within torque and travel; None where all go beyond.
+    """Find the input on which two models' positions differ most, within torque and travel; None where all go beyond.
 
     Sides that the log has count. Both begin at rest in the middle of the log's motion; `bias` is added to all inputs, N m.
     What another initial position or speed would make of the difference does not count.
     """
     assert record.torque is not None
+    models = [on_record(config, record) for config in pair]
     first_model = models[0]
     sides = [side for side in first_model.sides if side in record.positions]
     segments = segments_of(record, sides)

@@ -20,8 +20,8 @@ from jaxbl.quantity import Quantity
 from jaxbl.records.least_squares import BlockRegression, column_rms, rms
 
 from .diagnosis_task import DiagnosisTask
-from .fitted_model import FittedModel
 from .reference_log import ReferenceLog
+from .refit import FittedModel
 from .thresholds import LIMITS
 
 _STEP = 1e-3
@@ -46,8 +46,11 @@ def contradictions(task: DiagnosisTask, fitted: FittedModel, log: ReferenceLog, 
         log: what was fitted.
         driving: torque that drives the machine, rms, N m.
     """
-    parts = [(path, _rows_of(log, rows)) for path, rows in task.record.logs]
-    parts = [(path, part) for path, part in parts if part.segments]
+    parts = []
+    for path, rows in task.record.logs:
+        within = [segment for segment in log.segments if rows.start <= segment.rows.start and segment.rows.stop <= rows.stop]
+        if within:
+            parts.append((path, dataclasses.replace(log, segments=within)))
     if len(parts) < 2 or not fitted.free:
         return []
     folder = commonpath([path.parent for path, _ in parts])
@@ -124,9 +127,3 @@ def _apart(first: _Reading, other: _Reading, k: int, least: float) -> float:
     if not apart * max(first.torque[k], other.torque[k]) > least:
         return 0.0
     return float(apart / max(np.hypot(first.error[k], other.error[k]), 1e-300))
-
-
-def _rows_of(log: ReferenceLog, rows: slice) -> ReferenceLog:
-    """Return the segments of a log that lie in some rows."""
-    within = [segment for segment in log.segments if rows.start <= segment.rows.start and segment.rows.stop <= rows.stop]
-    return dataclasses.replace(log, segments=within)

@@ -6,7 +6,6 @@ has, transmission and effects at the smoothed motion, besides its nominal equati
 Otherwise the whole transmitted torque would go through the observer, whose lag on it would be taken for missing torque.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from jaxbl.records.least_squares import rms
 from jaxbl.records.linear_filters import filter_forwards
 
 from .neutral_effects import complete
-from .residuals import Residual, beyond_nominal, narrow
+from .residuals import Equation, Residual, evaluate_equations, low_passed, narrow
 
 _DRAWS = 6
 """Runs over the smoothed motion with drawn noise, by which the observers' own is measured: its deviation to a tenth."""
@@ -82,11 +81,11 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
     for i, segment in enumerate(segments):
         random, part = np.random.default_rng(i), segment.kinematics
         # a structure for which there is a program
-        beyond = beyond_nominal(complete(experiment), segment)
+        equations = evaluate_equations(complete(experiment), segment)
         modelled, readings = {}, {}
         for side in experiment.sides:
             smoothed = segment.smoothed[side]
-            modelled[side] = _hold_torque(*beyond[side]) / float(experiment.drive.inertia(side))
+            modelled[side] = _hold_torque(equations[side]) / float(experiment.drive.inertia(side))
             drawn = float(smoothed.noise) * random.standard_normal((_DRAWS, len(segment)))
             readings[side] = np.concatenate([segment.readings[side][None], part.position[side] + drawn])
         controls = _controls(bare, segment.torque, readings, modelled, part)
@@ -95,7 +94,7 @@ def observed_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
     return observed
 
 
-def _hold_torque(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
+def _hold_torque(equation: Equation) -> np.ndarray:
     """Torque to be held from each sample to the next, so that the implicit observer's position moves as under the true one.
 
     Held from sample k on, p_k moves the observer's positions by second differences of h^2 (p_{k-1} + p_k) / (2 J), where
@@ -103,8 +102,8 @@ def _hold_torque(smooth: np.ndarray, friction: np.ndarray) -> np.ndarray:
     mean of two samples for p_k the former is tau + h^2 tau'' / 4, hence the sixth that is subtracted; not of friction,
     which jumps. The explicit observer's own lag of half a period remains.
     """
-    torque = smooth - friction
-    torque[1:-1] -= np.diff(smooth, n=2) / 6.0
+    torque = equation.beyond - equation.friction
+    torque[1:-1] -= np.diff(equation.beyond, n=2) / 6.0
     return np.append(0.5 * (torque[:-1] + torque[1:]), torque[-1])
 
 
@@ -181,10 +180,9 @@ def compare_observers(
     for piece, smooth in zip(observed, residuals, strict=True):
         late = filter_forwards(smooth.torque, [share], [share - 1.0])
         low, _ = narrow(piece.residual, cutoff)
-        beside = dataclasses.replace(piece.residual, torque=late[piece.skipped :])
         seen_torques.append(low.torque)
         noise.append(low.deviation)
-        other.append(narrow(beside, cutoff)[0].torque)
+        other.append(low_passed(late[piece.skipped :], piece.residual, cutoff))
         bandwidth = low.bandwidth
     mine, theirs = np.concatenate(seen_torques), np.concatenate(other)
     size = math.sqrt(np.mean(mine**2) * np.mean(theirs**2))

@@ -5,7 +5,6 @@ is fitted but the state in which each window begins, from the window's first fif
 the zeros of its encoders, where the model has those of its own, from the log's first fifth, which is not scored either.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,10 +23,9 @@ from .blocks import standard_errors_better
 from .candidates import ZERO_SPREAD, owner_of
 from .choice import Chosen
 from .expected_errors import Expected, expected_errors, list_failed
-from .fitted_model import FittedModel
 from .linearised_model import find_driving_torque
 from .neutral_effects import without
-from .reference_log import Comparison, Errors, ReferenceLog
+from .reference_log import Comparison, ReferenceLog
 from .refit import ModelFits
 from .setup import Setup, quiet
 from .thresholds import LIMITS
@@ -84,57 +82,35 @@ def _take_zeros(chosen: Chosen, log: ReferenceLog) -> tuple[Chosen, ReferenceLog
     names = [owner_of(number)[0] for number in chosen.fitted.free]
     zeros = [i for i, name in enumerate(names) if name in EFFECTS and EFFECTS[name].in_log]
     for i in zeros:
-        chosen = chosen._replace(fitted=_fit_zero(chosen.fitted, i, first))
+        # the twist at which two encoders show no torque
+        fitted = chosen.fitted
+        number, theta, white = fitted.free[i], fitted.theta.copy(), fitted.white.copy()
+        free = make_free_parameters(fitted.experiment, [number.path], 1.0)
+        spread = np.array([ZERO_SPREAD / free[0].scale])
+        zero = ModelFits(fitted.experiment, free, spread, first.segments).fit({}, np.zeros(1))
+        theta[i] = number.theta(free[0].value(zero.theta[0]))
+        white[i, i] = zero.covariance[0, 0] * (free[0].scale / number.scale) ** 2
+        experiment = set_free_parameters(fitted.experiment, fitted.free, theta)
+        chosen = chosen._replace(fitted=fitted._replace(theta=theta, white=white, experiment=experiment))
     return (chosen, replace(later, at_rest=False)) if zeros else (chosen, log)
 
 
-def _fit_zero(fitted: FittedModel, i: int, log: ReferenceLog) -> FittedModel:
-    """Fit the twist at which two encoders show no torque, the i-th number of a model, to a log."""
-    number, theta, white = fitted.free[i], fitted.theta.copy(), fitted.white.copy()
-    free = make_free_parameters(fitted.experiment, [number.path], 1.0)
-    spread = np.array([ZERO_SPREAD / free[0].scale])
-    zero = ModelFits(fitted.experiment, free, spread, log.segments).fit({}, np.zeros(1))
-    theta[i] = number.theta(free[0].value(zero.theta[0]))
-    white[i, i] = zero.covariance[0, 0] * (free[0].scale / number.scale) ** 2
-    return fitted._replace(theta=theta, white=white, experiment=set_free_parameters(fitted.experiment, fitted.free, theta))
-
-
 def prove(setup: Setup, chosen: Chosen) -> Proof:
-    """Open what was held out, and compare the model that stands with it."""
+    """Open what was held out, and compare the model that stands with it, as it is and without one effect after the other."""
     record, log = open_held_out(setup)
     if setup.task.separate:
         chosen, log = _take_zeros(chosen, log)
     fitted = chosen.fitted
     before, after = log.compare(setup.nominal), log.compare(fitted.experiment)
     expected = expected_errors(log, fitted, after, setup.input_noise, chosen.driving)
-    sizes = _sizes(log, fitted.experiment)
+    # of what is to be predicted: the motion of each side about its mean, rad, and the torque that drives it, N m, rms
+    driving, _ = find_driving_torque(fitted.experiment, log.segments)
+    sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
+    sizes |= {f"torque_{side}": driving * float(fitted.experiment.drive.ratio(side)) for side in fitted.experiment.sides}
     weak = [name for name, channel in expected.items() if not channel.limit < sizes[name.partition(" ")[0]]]
     better = standard_errors_better(log, before, after)
-    untested, holdout_z = _leave_out_each(setup, chosen, log, after, expected)
-    return Proof(
-        record, log, before, after, expected,
-        # what tests nothing contradicts nothing
-        [name for name in list_failed(after.errors, expected) if name not in weak],
-        bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
-        weak, untested, holdout_z, sizes["torque_motor"],
-    )  # fmt: skip
-
-
-def _sizes(log: ReferenceLog, experiment: Experiment) -> Errors:
-    """Size of what is to be predicted, by channel: the motion of each side about its mean, rad, and the torque that drives
-    it, N m, rms."""
-    driving, _ = find_driving_torque(experiment, log.segments)
-    sizes = {name: float(np.std(values)) for name, values in log.readings().items()}
-    return sizes | {f"torque_{side}": driving * float(experiment.drive.ratio(side)) for side in experiment.sides}
-
-
-def _leave_out_each(
-    setup: Setup, chosen: Chosen, log: ReferenceLog, after: Comparison, expected: Mapping[str, Expected]
-) -> tuple[JsonObject, dict[str, float]]:
-    """Leave out one effect after the other: those without which the model would leave no more than a complete one may, and
-    the standard errors by which it predicts better with each that acts there."""
-    untested, holdout_z, model = {}, {}, chosen.fitted.experiment
-    for name in chosen.fitted.names:
+    untested, holdout_z, model = {}, {}, fitted.experiment
+    for name in fitted.names:
         less = without(model, name)
         compared = log.compare(less)
         torques = {"torque": _torque_between(log, model, less), "on_log": _torque_between(setup.fitted, model, less)}
@@ -142,7 +118,13 @@ def _leave_out_each(
             holdout_z[name] = standard_errors_better(log, compared, after)
         if not list_failed(compared.errors, expected):
             untested[name] = torques
-    return untested, holdout_z
+    return Proof(
+        record, log, before, after, expected,
+        # what tests nothing contradicts nothing
+        [name for name in list_failed(after.errors, expected) if name not in weak],
+        bool(fitted.names) and len(weak) < len(expected) and better < -LIMITS.difference,
+        weak, untested, holdout_z, driving,
+    )  # fmt: skip
 
 
 def _torque_between(log: ReferenceLog, model: Experiment, other: Experiment) -> float:

@@ -226,7 +226,7 @@ class ReferenceLog:
         """A dry friction and a steady torque of 1 N m on a side, behind the low-pass as in :meth:`missing`, shape
         (2, samples), 0 where the model has one; and where the side moves, shape (samples,)."""
         effects = [effect for effect in experiment.effects if effect.place == side]
-        dry = not any(type(effect).exclusive for effect in effects)
+        dry = not any(effect.exclusive for effect in effects)
         steady = not any(isinstance(effect, ConstantTorque) for effect in effects)
         pieces, columns = self.find_lacking(experiment)[side], []
         for segment, piece in zip(self.segments, pieces, strict=True):

@@ -119,41 +119,16 @@ def as_smoothed(values: np.ndarray, smoothed: Smoothed, period: float) -> np.nda
     return accelerations.T.reshape(values.shape)
 
 
-def _dry(
-    experiment: Experiment,
-    side: str,
-    part: Kinematics,
-    states: Any,
-    driving: Array,
-    acting: tuple[Array, Array],
-    held: Array,
-) -> tuple[Array, Array]:
-    """Dry friction along a part, N m, by what else is `acting` on the side (its input is `driving`) and its level; its
-    derivative by the velocity at a reversal, whose time the velocity's noise leaves open."""
-    (total, level), velocity, acceleration = acting, part.velocity[side], part.acceleration[side]
-    period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
-    # the share of the time around a sample in forward motion less that in backward motion, seen as the rest is
-    step = jnp.maximum(jnp.abs(acceleration) * period, jnp.finfo(float).tiny)
-    passage = jnp.clip(velocity / step, -1.0, 1.0)
-    direction = passage * (2.0 - jnp.abs(passage))
-    # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
-    motion = Motion(part.time, part.position[side], velocity, driving)
-    bent, most = experiment.plant.holding_torque(side, motion, states)
-    inertia = experiment.plant.inertia(side)
-    needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
-    friction = jnp.where(held, needed, level * direction)
-    return friction, jnp.where(held, 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
-
-
-class _Equation(NamedTuple):
+class Equation(NamedTuple):
     """Equation of motion of a side along a part, torques in N m.
 
     Attributes:
         inertia: of the side, kg m^2.
         taken: by it.
         modelled: that the smoother sees.
-        beyond: modelled less that of the nominal equation, in which the inertia is the nominal one; without dry friction.
-        friction: dry friction.
+        beyond: modelled less that of the nominal equation J dv/dt = (input) - B v, the right-hand side that an observer
+            (7)-(8) knows; without dry friction.
+        friction: dry friction, which is to be subtracted from that.
         by_position, by_velocity: derivatives of the modelled torque by the positions and velocities.
     """
 
@@ -167,10 +142,11 @@ class _Equation(NamedTuple):
 
 
 @jit
-def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, _Equation]:
+def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Array, " samples"]]) -> dict[str, Equation]:
     """Equations of all sides along a part; `held`: where a side is not shown to move for a while."""
     states, torque = effect_path(experiment, part)
     drive, equations = experiment.drive, {}
+    period = (part.time[-1] - part.time[0]) / (len(part.time) - 1)
 
     def of(position: dict, velocity: dict, *motion: Any) -> tuple[Any, Any]:
         """All modelled torques on each side; and apart from one another those without set-valued friction, and its level."""
@@ -185,35 +161,37 @@ def _equations(experiment: Experiment, part: Kinematics, held: dict[str, Bool[Ar
         part.position, part.velocity, states, torque, part.time, part.transmitted
     )
     for side in experiment.sides:
-        total, (by_position, by_velocity) = totals[side], slopes[side]
+        total, level, (by_position, by_velocity) = totals[side], levels[side], slopes[side]
+        inertia, acceleration, velocity = experiment.plant.inertia(side), part.acceleration[side], part.velocity[side]
         driving = torque if side == "motor" else jnp.zeros_like(torque)
-        friction, turning = _dry(experiment, side, part, states, driving, (total, levels[side]), held[side])
+        # the share of the time around a sample in forward motion less that in backward motion, seen as the rest is
+        step = jnp.maximum(jnp.abs(acceleration) * period, jnp.finfo(float).tiny)
+        passage = jnp.clip(velocity / step, -1.0, 1.0)
+        direction = passage * (2.0 - jnp.abs(passage))
+        # what is not shown to move for a while may be held: friction is then what is missing, as far as it goes
+        motion = Motion(part.time, part.position[side], velocity, driving)
+        bent, most = experiment.plant.holding_torque(side, motion, states)
+        needed = jnp.clip(total + bent - inertia * acceleration, -(level + most), level + most) - bent
+        friction = jnp.where(held[side], needed, level * direction)
+        # by the velocity at a reversal, whose time the velocity's noise leaves open
+        turning = jnp.where(held[side], 0.0, 2.0 * level * (1.0 - jnp.abs(passage)) / step)
         # the input is a mean around the sample already; of the rest, the mean that the position's second differences see:
         # over the period on either side, weighted by a triangle, to fourth order
         without_input = total - driving
         modelled = driving + without_input.at[1:-1].add(jnp.diff(without_input, n=2) / 12.0) - friction
-        inertia, acceleration, velocity = experiment.plant.inertia(side), part.acceleration[side], part.velocity[side]
         added = (inertia - drive.inertia(side)) * acceleration
         nominal = drive.inertia(side) * drive.acceleration(side, velocity, part.torque)
         by_velocity = by_velocity | {side: by_velocity[side] - turning}
-        equations[side] = _Equation(
+        equations[side] = Equation(
             inertia, inertia * acceleration, modelled, total - added - nominal, friction, by_position, by_velocity
         )
     return equations
 
 
-def _along(experiment: Experiment, segment: Segment) -> dict[str, _Equation]:
+def evaluate_equations(experiment: Experiment, segment: Segment) -> dict[str, Equation]:
+    """Evaluate the equation of motion of each side along a segment."""
     held = {side: smoothed.find_standstill(segment.period) for side, smoothed in segment.smoothed.items()}
     return jax.tree.map(np.asarray, _equations(experiment, segment.kinematics, held))
-
-
-def beyond_nominal(experiment: Experiment, segment: Segment) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Modelled torque on each side less that of its nominal equation, in which the inertia is the nominal one, N m.
-
-    What transmission and effects add to J dv/dt = (input) - B v, the right-hand side that an observer (7)-(8) knows; and,
-    on its own, the dry friction that is to be subtracted.
-    """
-    return {side: (equation.beyond, equation.friction) for side, equation in _along(experiment, segment).items()}
 
 
 def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> SideResiduals:
@@ -228,7 +206,7 @@ def residual_torques(experiment: Experiment, segments: Sequence[Segment]) -> Sid
     for segment in segments:
         part, responses = segment.kinematics, _responses(segment)
         sensor = 0.0 if part.transmitted is None else estimate_white_noise([np.asarray(part.transmitted)])
-        equations = _along(experiment, segment)
+        equations = evaluate_equations(experiment, segment)
         for side, pieces in residuals.items():
             equation = equations[side]
             missing = equation.taken - as_smoothed(equation.modelled, segment.smoothed[side], segment.period)
@@ -254,7 +232,7 @@ def _responses(segment: Segment) -> dict[str, _Response]:
 def _noise(
     segment: Segment,
     side: str,
-    equation: _Equation,
+    equation: Equation,
     sensor: float,
     responses: Mapping[str, _Response],
 ) -> tuple[np.ndarray, np.ndarray]:

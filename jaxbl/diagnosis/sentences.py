@@ -53,7 +53,8 @@ def sentence_of(located: Localised, unit: str = "N m") -> str:
             f"at {lines[0].frequency:.4g} Hz; {percent(lines[0].power_share)} of the residual power is a narrow peak there"
         )
     elif best >= _TELLING:
-        values = _class_means(telling, unit)
+        means = [region for region in telling.regions if region.label and abs(region.mean_z) > LIMITS.significant]
+        values = f" ({', '.join(f'{region.mean:+.2g} {unit} {region.label}' for region in means)})" if means else ""
         clauses.append(f"{place}{values}; {percent(telling.explained)} of the residual power goes with it")
     if not clauses and located.excess_z < LIMITS.significant:
         return f"{side}, {_faint(located, unit)}"
@@ -75,12 +76,6 @@ def _faint(located: Localised, unit: str) -> str:
     if abs(region.mean_z) >= region.excess_z:
         return f"faint: {region.mean:+.2g} ± {region.mean_error:.1g} {unit} on average {place}"
     return f"faint: {np.sqrt(max(region.excess, 0.0)):.2g} {unit} rms beyond noise {place}"
-
-
-def _class_means(coordinate: Coordinate, unit: str) -> str:
-    """Mean torques of the few classes of a coordinate."""
-    significant = [region for region in coordinate.regions if region.label and abs(region.mean_z) > LIMITS.significant]
-    return f" ({', '.join(f'{region.mean:+.2g} {unit} {region.label}' for region in significant)})" if significant else ""
 
 
 def _find_crowded(located: Localised) -> tuple[float, str] | None:

@@ -77,8 +77,11 @@ class Setup(NamedTuple):
     input_noise: InputNoise
 
 
-def set_up(task: DiagnosisTask) -> Setup:
+def set_up(task: DiagnosisTask, noise: InputNoise | None = None) -> Setup:
     """The nominal model on the log that is fitted; what is held out is not opened.
+
+    Models are driven by the recorded input less what the drive did not feel of it, by the nominal model unless its `noise`
+    is given.
 
     Raises:
         InputError: a model that diverges, or whose effects are in an order that others would change.
@@ -99,7 +102,14 @@ def set_up(task: DiagnosisTask) -> Setup:
                 f"{record.path}: the model diverges under this log's input: within {WINDOW:g} s its {side} leaves the "
                 f"measured motion by {apart:.2g} times the whole of it; a number of it, or its sign, is wrong"
             )
-    return _drive_by_input(task, bare, nominal, free, prior, recorded, _input_noise(record, nominal, recorded))
+    noise = noise or _input_noise(record, nominal, recorded)
+    channels, segments = record.statistics.channels, quiet(recorded, noise.unfelt)
+    lacking = residual_torques(nominal, segments)
+    sliding = [side for side in nominal.sides if channels[POSITION_CHANNELS[side]].unit == "m"]
+    coordinates = all_coordinates(nominal, segments, lacking, sliding)
+    located = localise(nominal, lacking, segments, coordinates)
+    fitted = ReferenceLog(segments, {name: place.bandwidth for name, place in located.items()}, at_rest)
+    return Setup(task, sliding, bare, nominal, free, prior, recorded, fitted, lacking, coordinates, located, noise)
 
 
 def doubt_input(setup: Setup, model: Experiment) -> Setup | None:
@@ -107,24 +117,7 @@ def doubt_input(setup: Setup, model: Experiment) -> Setup | None:
     if setup.input_noise.unfelt > 0.0:
         return None
     noise = _input_noise(setup.task.record, model, setup.recorded)
-    if not noise.unfelt > 0.0:
-        return None
-    return _drive_by_input(setup.task, setup.bare, setup.nominal, setup.free, setup.prior, setup.recorded, noise)
-
-
-def _drive_by_input(
-    task: DiagnosisTask, bare: Experiment, nominal: Experiment, free: tuple[FreeParameter, ...], prior: np.ndarray,
-    recorded: Sequence[Segment], noise: InputNoise,
-) -> Setup:  # fmt: skip
-    """Set up with the recorded input less what the drive did not feel of it."""
-    channels, segments = task.record.statistics.channels, quiet(recorded, noise.unfelt)
-    lacking = residual_torques(nominal, segments)
-    sliding = [side for side in nominal.sides if channels[POSITION_CHANNELS[side]].unit == "m"]
-    coordinates = all_coordinates(nominal, segments, lacking, sliding)
-    located = localise(nominal, lacking, segments, coordinates)
-    bandwidth = {name: place.bandwidth for name, place in located.items()}
-    fitted = ReferenceLog(segments, bandwidth, task.config.log.initial_state == "rest")
-    return Setup(task, sliding, bare, nominal, free, prior, recorded, fitted, lacking, coordinates, located, noise)
+    return set_up(setup.task, noise) if noise.unfelt > 0.0 else None
 
 
 def quiet(segments: Sequence[Segment], noise: float) -> Sequence[Segment]:

@@ -19,7 +19,7 @@ from jaxbl.records.least_squares import BlockRegression, mean_error
 from .candidates import Candidate, Forces, MotionTorques, columns_of, contains, replaces
 from .linearised_model import Linear
 from .reference_log import ReferenceLog
-from .residuals import SideResiduals, as_smoothed, low_passed, narrow
+from .residuals import SideResiduals, as_smoothed, low_passed
 from .thresholds import LIMITS
 
 _BLOCKS = 10
@@ -90,8 +90,7 @@ class TorqueRegression:
                 # what acts on the input acts on the motor, which is the first side
                 columns = force.on(i, len(segment)) + (force.on(-1, len(segment)) if i == 0 else 0.0)
                 columns = as_smoothed(columns, segment.smoothed[side], segment.period)
-                filtered = low_passed(columns, residual, log.bandwidth[side])
-                rows.append(np.vstack([filtered, narrow(residual, log.bandwidth[side])[0].torque]))
+                rows.append(low_passed(np.vstack([columns, residual.torque]), residual, log.bandwidth[side]))
             *columns, target = np.concatenate(rows, axis=1)
             # each side over its own missing torque
             size = np.sqrt(np.sum(target**2))

@@ -21,7 +21,7 @@ from jaxbl.records.least_squares import BlockRegression, mean_error
 
 from .blocks import QUARTERS, standard_errors_better
 from .reference_log import BLOCKS, Comparison, ReferenceLog, parts_of_blocks
-from .residuals import Residual, SideResiduals, as_smoothed, low_passed, narrow
+from .residuals import Residual, SideResiduals, as_smoothed, low_passed
 from .thresholds import LIMITS
 
 _POINTS = {"position": 25, "turn": 37, "speed": 17}
@@ -122,7 +122,7 @@ def tabulate(
 def _fit_tables(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, rotary: bool) -> list[Table]:
     """Tables of the torque that a side lacks, by cross-validation; none where they take nothing away."""
     cutoff = log.bandwidth[side]
-    target = -np.concatenate([narrow(residual, cutoff)[0].torque for residual in lacking])
+    target = -np.concatenate([low_passed(residual.torque, residual, cutoff) for residual in lacking])
     choices = _choices(log.segments, side, rotary)
     widths = {over: len(points) for over, points in choices.items()}
     columns = {
@@ -141,7 +141,12 @@ def _fit_tables(log: ReferenceLog, lacking: Sequence[Residual], side: str, *, ro
         if len(target) < _LEAST * sum(widths[over] for over in overs):
             continue
         matrix = np.concatenate([columns[over] for over in overs], axis=1)
-        regressions = [_regress(matrix, target, [widths[over] for over in overs], stiffness) for stiffness in _STIFFNESS]
+        bends = np.asarray(block_diag(*(np.diff(np.eye(widths[over]), n=2, axis=0) for over in overs)))
+        size, ridge = np.mean(matrix**2) * len(target), _RIDGE * np.eye(matrix.shape[1])
+        regressions = [
+            BlockRegression.of(target, matrix, BLOCKS, (ridge + stiffness * bends.T @ bends) * size)
+            for stiffness in _STIFFNESS
+        ]
         # mean squared errors of each block left out
         squares, regression = min(((fit.held_out(), fit) for fit in regressions), key=lambda trial: np.mean(trial[0]))
         gain = nothing - squares
@@ -180,13 +185,6 @@ def _columns(segment: Segment, lacking: Residual, side: str, over: str, points: 
     values = np.mod(values, _TURN) if over == "turn" else np.clip(values, points[0], points[-1])
     hats = np.stack([np.interp(values, points, heights) for heights in np.eye(len(points))])
     return low_passed(as_smoothed(hats, smoothed, segment.period), lacking, cutoff).T
-
-
-def _regress(matrix: np.ndarray, target: np.ndarray, widths: Sequence[int], stiffness: float) -> BlockRegression:
-    """Prepare penalised least squares of a torque on the columns of tables with so many points each."""
-    second = np.asarray(block_diag(*(np.diff(np.eye(width), n=2, axis=0) for width in widths)))
-    penalty = (_RIDGE * np.eye(matrix.shape[1]) + stiffness * second.T @ second) * (np.mean(matrix**2) * len(target))
-    return BlockRegression.of(target, matrix, BLOCKS, penalty)
 
 
 def _numbers(tables: Sequence[Table]) -> JsonObject:

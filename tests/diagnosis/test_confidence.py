@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxbl.diagnosis.confidence import confirm, explained_share, weigh
+from jaxbl.diagnosis.confidence import explained_share, weigh
 from jaxbl.diagnosis.effect_search import Explanation, Gain, Trial
 from jaxbl.diagnosis.expected_errors import Expected
 from jaxbl.drive import make_effect
@@ -30,9 +30,8 @@ def weigh_effect(rival=None, *, error=0.001, gain=9.0, name=NAME, unknown=0.0, l
         errors=lambda: {f"effects.{name}.torque": error} | {f"effects.{name}.{leaf}": 0.1 * error for leaf in numbers},
     )
     rivals = [] if rival is None else [Trial((RIVAL,), fitted, Gain(*rival))]
-    remainder = {"motor.time": (unknown, 0.1)}
     plainer = [] if plain is None else [Trial((NAME,), fitted, Gain(*plain))]
-    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, remainder)
+    explanation = Explanation(fitted, {name: Gain(50.0, gain)}, {name: rivals}, {name: plainer}, unknown)
     (finding,) = weigh(explanation, 0.2 * left)
     return finding
 
@@ -49,18 +48,18 @@ def test_no_effect_is_surer_than_that_its_torque_is_not_zero():
 
 def test_no_finding_is_surer_than_held_out_data_make_it():
     finding = weigh_effect()
-    chances = [confirm([finding], {NAME: z})[0].confidence for z in (-2.0, 0.0, 2.0, 3.0, 6.0)]
+    chances = [finding.confirm(z).confidence for z in (-2.0, 0.0, 2.0, 3.0, 6.0)]
     # nothing there shows it: the prior odds
     assert chances[1] == pytest.approx(1.0 / (1.0 + np.exp(2.0)))
     assert chances[2] == pytest.approx(0.5) and chances[4] == pytest.approx(finding.confidence)
     assert chances == sorted(chances)
     # where it does not act nothing is said of it
-    assert confirm([finding], {}) == (finding,)
+    assert finding.confirm(np.inf) == finding
     # two that tie are one torque
     tied = weigh_effect((50.0, 0.0))
-    (doubted,) = confirm([tied], {NAME: 2.0})
+    doubted = tied.confirm(2.0)
     assert doubted.confidence == pytest.approx(0.25) and doubted.alternatives == ((RIVAL, pytest.approx(0.25)),)
-    assert confirm([tied], {NAME: 6.0})[0].confidence == pytest.approx(0.5)
+    assert tied.confirm(6.0).confidence == pytest.approx(0.5)
 
 
 def test_an_effect_is_no_surer_than_that_laws_of_others_do_not_miss_its_torque():

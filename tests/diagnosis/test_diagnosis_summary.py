@@ -12,6 +12,6 @@ from jaxbl.diagnosis.diagnosis_summary import extended_study
 def test_a_model_that_only_the_logs_period_can_simulate_has_that_period():
     """A dead time of 30 ms: six samples of the log, thirty of the study."""
     config = read_config(rigid_study(run={"sample_period": 1e-3, "substeps": 10}))
-    record: Any = SimpleNamespace(sample_period=5e-3)
+    task: Any = SimpleNamespace(config=config, record=SimpleNamespace(sample_period=5e-3))
     for delay, period in ((0.03, 5e-3), (0.01, 1e-3)):
-        assert extended_study(config, {"actuator.delay": {"delay": delay}}, {}, record).run.sample_period == period
+        assert extended_study(task, {"actuator.delay": {"delay": delay}}, {}).run.sample_period == period

@@ -221,4 +221,4 @@ def test_a_free_function_without_a_solution_shows_nothing(monkeypatch):
     linear = SimpleNamespace(best_predictor=predictor, products=lambda *_: models, signals=[])
     monkeypatch.setattr(effect_search, "functions_of", lambda _: [function])
     search = SimpleNamespace(floor=0.0)
-    assert EffectSearch.remainder(search, SimpleNamespace(linear=linear)) == {"motor.time": (-np.inf, 0.0)}  # type: ignore
+    assert EffectSearch.find_largest_gain(search, SimpleNamespace(linear=linear)) == 0.0  # type: ignore

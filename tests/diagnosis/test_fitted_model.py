@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxbl.diagnosis.fitted_model import FittedModel
+from jaxbl.diagnosis.refit import FittedModel
 from jaxbl.drive import make_effect
 
 FRICTION, DRAG, WAVE = "motor.presliding_friction", "motor.quadratic_drag", "motor.cogging"

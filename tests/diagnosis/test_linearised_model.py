@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -173,7 +175,8 @@ def test_numbers_of_waves_are_those_of_the_effect(geared_model):
 def test_products_are_those_of_the_errors(sides):
     """Summed block by block, initial states eliminated, against a decomposition of all errors at once."""
     model = linearise(sides)
-    (alone,) = model.products((), [1e-6] * sides, np.ones(sides))
+    predictor: Any = SimpleNamespace(smoothness=[1e-6] * sides, deviation=np.ones(sides))
+    (alone,) = model.products((), predictor)
     columns = prediction_errors(model)
     assert alone.products == pytest.approx(columns.T @ columns, rel=1e-6, abs=1e-9 * np.max(alone.products))
 
@@ -184,12 +187,12 @@ def test_products_of_candidates_are_those_of_their_errors(geared_model):
     variants = variants_of(model.experiment, list(SMALL_NUMBERS), lambda name: LOG)
     model_columns, smoothness = 1 + len(model.free), [1e-6] * 2
     noise = np.array([2e-5, 3e-5])
-    models = model.products(variants, smoothness, noise)
+    models = model.products(variants, SimpleNamespace(smoothness=smoothness, deviation=noise))
     assert sum(variant.width for variant in variants) > 2 * module._TOGETHER
     forces = Forces(columns_of(variants, model.signals[0]))
     predicted = model.steps[0].errors(find_gains(smoothness, model.period), forces)
     gram = np.einsum("s,tsc,tsd->cd", noise**-2.0, predicted, predicted)
-    expected = module._eliminate(gram, model.states)
+    expected = module._eliminate(gram, model.states)[0]
     size = np.sqrt(np.diag(expected))
     begin = end = model_columns
     assert [products.candidate for products in models[1:]] == variants
@@ -246,7 +249,8 @@ def test_what_rounding_takes_is_known(growth):
     basis = np.linalg.qr(state_columns / np.linalg.norm(state_columns, axis=0))[0]
     remainder = columns[:, :3] - basis @ (basis.T @ columns[:, :3])
     true = float(remainder[:, 0] @ remainder[:, 0])
-    error, loss_estimate = abs(module._eliminate(gram, states)[0, 0] - true), module._response_and_loss(gram, states)[1]
+    rest, _, loss_estimate = module._eliminate(gram, states)
+    error = abs(rest[0, 0] - true)
     assert error < max(30.0 * loss_estimate, 1e-9 * true)
     assert loss_estimate < module._LOST or growth > 5.0
     assert loss_estimate > module._LOST or growth < 20.0

@@ -70,7 +70,7 @@ def test_a_model_with_tables_predicts_better_and_runs_as_a_study(tmp_path):
     assert tabulation is not None and tabulation.z > 2.0
     for name in ("theta_e", "torque_motor"):
         assert tabulation.compared.errors[name] < 0.6 * compared.errors[name]
-    longer = extended_study(task.config, {}, {}, task.record, tabulation.effects())
+    longer = extended_study(task, {}, {}, tabulation.effects())
     (effect,) = longer.effects
     assert effect.kind == "motor.tabulated" and len(effect.positions) == len(effect.position_torques)
     assert read_config(longer.to_dict()).build().effects[0].positions == pytest.approx(effect.positions)

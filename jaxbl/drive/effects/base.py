@@ -96,14 +96,14 @@ class Role(NamedTuple):
         neutral: the number with which the effect does nothing.
         trials: the values to try on a log with some :class:`Scales`. A size has one, small enough for a linear torque.
         width: prior standard deviation: of an angle in rad, of a shape in its logarithm.
-        trial_count: number of values among which a harmonic was chosen, if that is not the number of `trials`.
+        among_waves: whether a harmonic was chosen among all waves that a log tells apart, and not among `trials` alone.
     """
 
     kind: Literal["size", "angle", "harmonic", "frequency", "shape", "held"]
     neutral: float
     trials: Callable[[Scales], Sequence[float]]
     width: float = 1.0
-    trial_count: Callable[[Scales], int] | None = None
+    among_waves: bool = False
 
 
 def size(unit: str, doc: str, *, trial: Callable[[Scales], float] = lambda log: 1.0, **limits: Any) -> Any:
@@ -119,15 +119,9 @@ def angle(doc: str) -> Any:
     return parameter("rad", doc, default=0.0, role=Role("angle", 0.0, lambda log: (0.0,), 1.8))
 
 
-def harmonic(
-    doc: str,
-    trials: Callable[[Scales], Sequence[float]],
-    *,
-    trial_count: Callable[[Scales], int] | None = None,
-    **limits: Any,
-) -> Any:
+def harmonic(doc: str, trials: Callable[[Scales], Sequence[float]], *, among_waves: bool = False, **limits: Any) -> Any:
     """Declare a number of periods a turn, which is chosen among the values of `trials`."""
-    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, trial_count=trial_count), **limits)
+    return parameter("1/turn", doc, above=0.0, role=Role("harmonic", 1.0, trials, among_waves=among_waves), **limits)
 
 
 def frequency(doc: str) -> Any:
@@ -278,25 +272,27 @@ class AbstractEffect(eqx.Module):
     # class methods for a diagnosis
 
     @classmethod
-    def roles(cls) -> dict[str, Role]:
-        """Role of each number; empty for an effect that a diagnosis does not try."""
+    def roles(cls, *kinds: str) -> dict[str, Role]:
+        """Role of each number, or of those of some `kinds`; empty for an effect that a diagnosis does not try."""
         roles = {field.name: declaration.role for field, declaration in parameters(cls)}
-        return {} if None in roles.values() else roles  # type: ignore[return-value]
+        if None in roles.values():
+            return {}
+        return {name: role for name, role in roles.items() if not kinds or role.kind in kinds}
 
     @classmethod
-    def neutral(cls) -> Numbers:
-        """Numbers with which the effect does nothing; empty for an effect without :meth:`roles`."""
-        return {name: role.neutral for name, role in cls.roles().items()}
+    def neutral(cls, *kinds: str) -> Numbers:
+        """Numbers with which the effect does nothing, or some `kinds` of them; empty for an effect without :meth:`roles`."""
+        return {name: role.neutral for name, role in cls.roles(*kinds).items()}
 
     @classmethod
     def sizes(cls) -> list[str]:
         """Names of the numbers that its torque is proportional to."""
-        return [name for name, role in cls.roles().items() if role.kind == "size"]
+        return list(cls.roles("size"))
 
     @classmethod
     def list_released(cls, numbers: Numbers) -> list[str]:
         """List the numbers that are held by default, and are not neutral."""
-        return [name for name, role in cls.roles().items() if role.kind == "held" and numbers[name] != role.neutral]
+        return [name for name, role in cls.roles("held").items() if numbers[name] != role.neutral]
 
     @classmethod
     def plainer(cls, numbers: Numbers) -> dict[str, Numbers]:

@@ -24,10 +24,6 @@ def _select_covered(harmonics: Iterable[float], log: Scales) -> list[float]:
     return sorted(float(n) for n in harmonics if n * log.travel > TRIAL_ARC)
 
 
-def _count_waves(log: Scales) -> int:
-    return log.wave_count
-
-
 def _ripple_harmonics(log: Scales) -> list[float]:
     return _select_covered({n * pairs for n in _RIPPLE_HARMONICS for pairs in _POLE_PAIRS}, log) if log.torque else []
 
@@ -101,7 +97,7 @@ class Cogging(SideEffect):
     kind = "cogging"
     places = ("motor",)
     amplitude: Scalar = size("N m", "amplitude A")
-    harmonic: Scalar = harmonic("periods n a turn", lambda log: log.waves, trial_count=_count_waves)
+    harmonic: Scalar = harmonic("periods n a turn", lambda log: log.waves, among_waves=True)
     phase: Scalar = angle("phase at theta = 0")
 
     def resist(self, state, motion):
@@ -123,7 +119,7 @@ class CoggingHarmonics(SideEffect):
     places = ("motor",)
     special_cases: ClassVar = {"cogging": _largest_wave}
     # a diagnosis tries it after a single wave, whose harmonic was chosen among those of cogging
-    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, trial_count=_count_waves)
+    harmonic: Scalar = harmonic("periods n a turn", _base_harmonics, among_waves=True)
     sine: Scalar = size("N m", "s_1", default=0.0)
     cosine: Scalar = size("N m", "c_1", default=0.0)
     sine_2: Scalar = size("N m", "s_2", default=0.0)
