@@ -40,7 +40,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     rebased = [at_period(model, record.sample_period) for model in (nominal, fitted)]
     at_rest = config.log.initial_state == "rest"
     segments = segments_of(record, nominal.sides, at_rest)
-    windows, _ = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
+    windows = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
     left = [eliminate_starts(model, windows).residual for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
@@ -102,7 +102,7 @@ def _by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
     return {
         "kind": "prediction_error" if search_fit.smoothness else "output_error",
         "window": search_fit.samples * record.sample_period,
-        "windows": len(search_fit.firsts),
+        "windows": len(search_fit.windows.rows),
         "converged": search_fit.fit.converged,
         "starts": len(search_fit.starts),
         "starts_agreeing": sum(search_fit.starts),

@@ -51,7 +51,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
         torques = model_torques(fitted, segment.kinematics, deviation)
         named = {"torque" if name == "transmission" else f"{name}.effects": torque for name, torque in torques.items()}
         pieces.append(motion_columns(segment) | named)
-    rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)).ravel()
+    rows = (search_fit.windows.rows[:, None] + np.arange(search_fit.samples)).ravel()
     for i, side in enumerate(fitted.sides):
         column = columns[f"{side}.residual"] = np.full(len(record.time), np.nan)
         column[rows] = search_fit.windows.noise[side] * search_fit.fit.residual[:, :, i].ravel()

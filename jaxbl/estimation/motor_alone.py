@@ -26,7 +26,7 @@ from .logs import LogTask, arrays
 from .regression import balance, transmit
 from .search import SearchFit
 from .segments import Segment, at_period, segments_of
-from .trajectory import Fit, cut
+from .trajectory import Fit, Windows
 from .unseen_load import SHOWN, Gap, Point, UnseenLoad, find_gap, half_gap_of, is_known, widths
 
 
@@ -174,14 +174,13 @@ def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collec
     visible = sought[width_sought.deviations < UNSEEN]
     torque = np.concatenate([segment.torque for segment in model.segments])
     # all of the log as one window, without a state of its own
-    windows = cut(torque, {}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque))
-    residual = (point.errors / model.noise)[None, :, None]
-    none = np.zeros((*residual.shape, 0))
-    fit = Fit(point.theta[visible], windows.start, residual, none, True)
+    no_state, zero = PlantState({}, {}, ()), np.zeros(1, int)
+    windows = Windows(torque[None], {}, zero, no_state, {"motor": model.noise}, zero, np.empty(0), zero)
+    fit = Fit(point.theta[visible], no_state, (point.errors / model.noise)[None, :, None], np.empty(0), True)
     return SearchFit(
         free=tuple(model.free[i] for i in visible), fit=fit,
         spread=width.only(visible)._replace(variance=point.variance / model.noise**2),
-        windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
+        windows=windows, smoothness={"motor": point.smoothness},
         refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
         condition=condition, steps=model.experiment.run.substeps,
     )  # fmt: skip

@@ -11,6 +11,7 @@ from hidden.simulator import Machine, Run, simulate
 from hidden_log import GAP, GEARED
 from scipy.optimize import least_squares
 from small_study import rigid_study, small_study
+from trace_segment import cut
 
 from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
@@ -19,7 +20,7 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.free_parameters import SignalSizes, make_free_parameters, set_free_parameters
 from jaxbl.estimation.intervals import refusals, spread
 from jaxbl.estimation.smoother import smooth
-from jaxbl.estimation.trajectory import Fit, cut, fit
+from jaxbl.estimation.trajectory import Fit, fit
 from jaxbl.fused.compilation import jit
 
 TRUE = {
