@@ -18,16 +18,20 @@ from jaxbl.records.least_squares import rms
 from .free_parameters import set_free_parameters
 from .intervals import NORMAL, Profile, Refusal, interval
 from .logs import LogTask, decimation
-from .regression import Kinematics, MotionShare, errors
+from .regression import Kinematics, MotionShare, decimate_balances
 from .search import SearchFit, is_noise
 from .segments import at_period, long_enough, segments_of, windows_of
 from .trajectory import eliminate_starts
 
 
 def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
-    """Measure how far a model misses the torques of a log after decimation, by equation, with units."""
-    equations = errors(experiment, parts, factor)
-    return {name: figures | {"unit": record.unit_of(name, "N m")} for name, figures in equations.items()}
+    """Measure how far a model misses the torques of a log after decimation, rms and relative to the driving torque."""
+    figures = {}
+    for name, equation in decimate_balances(experiment, parts, factor).items():
+        left, drive = (rms(np.asarray(torque)) for torque in equation)
+        relative = left / drive if drive > 0.0 else float("nan")
+        figures[name] = {"rms": left, "relative": relative, "unit": record.unit_of(name, "N m")}
+    return figures
 
 
 def describe_position(record: Record, side: str, noise: float, **errors: float) -> JsonObject:

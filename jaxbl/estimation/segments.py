@@ -21,7 +21,7 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
 from .free_parameters import SignalSizes
-from .regression import Kinematics, Path, effect_states, kinematics_from
+from .regression import Kinematics, Path, effect_states
 from .smoother import Smoothed, smooth
 from .trajectory import Windows
 
@@ -76,9 +76,12 @@ class Segment:
 
     @cached_property
     def kinematics(self) -> Kinematics:
-        """The smoothed motion as the equations of motion take it."""
-        states = {side: motion.state for side, motion in self.smoothed.items()}
-        return kinematics_from(self.time, self.torque, states, self.transmitted, self.before)
+        """The smoothed motion as the equations of motion take it; the input is held from each sample to the next."""
+        before = np.empty(0) if self.before is None else self.before
+        held = np.concatenate([before, self.torque])
+        earlier, mean = np.split(0.5 * (np.append(held[:1], held[:-1]) + held), [len(before)])
+        motion = [{side: smoothed.state[:, i].copy() for side, smoothed in self.smoothed.items()} for i in range(3)]
+        return Kinematics(self.time, mean, *motion, self.transmitted, before=earlier if len(earlier) else None)
 
 
 def skip_unknown_input(record: Record, at_rest: bool) -> Record:
