@@ -23,7 +23,6 @@ from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
 from jaxbl.records import POSITION_CHANNELS, LogTable, Record
-from jaxbl.records.least_squares import student_interval
 from jaxbl.records.live import (
     Datagrams,
     FollowedFile,
@@ -57,6 +56,10 @@ BLIND_WINDOWS = 10.0
 """Windows without a number after which a watch is blind, where nothing else is stated."""
 _QUIET = 10.0
 """Seconds between remarks on a stream from which nothing comes, or from which rows are left out."""
+_LAW_UNITS = {"half_gap": "rad", "stiffness": "N m/rad"}
+"""Numbers of the law, which are taken from the side that determines them best, and their units on the motor's side."""
+_FRICTION_UNITS = {"coulomb": "N m", "viscous": "N m s/rad"}
+"""Numbers of each side itself, and their units."""
 
 Values = JsonObject
 """What is known at a time; keys are the columns of `watch.csv`."""
@@ -205,8 +208,8 @@ def _find_units(log: LogTable) -> dict[str, dict[str, str]]:
         is_linear = log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m"
         return {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
 
-    law = find_units("motor", {"half_gap": "rad", "stiffness": "N m/rad"})
-    return {side: law | find_units(side, {"coulomb": "N m", "viscous": "N m s/rad"}) for side in POSITION_CHANNELS}
+    law = find_units("motor", _LAW_UNITS)
+    return {side: law | find_units(side, _FRICTION_UNITS) for side in POSITION_CHANNELS}
 
 
 def run_watch(
@@ -273,19 +276,17 @@ def describe_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{number} {kind}" for kind, number in counts.items())
 
 
-def _number_names(experiment: Experiment) -> tuple[list[str], list[str]]:
-    """Return the numbers of each side, and those of the law, which are taken from the side that determines them best."""
+def _list_law_numbers(experiment: Experiment) -> list[str]:
     assert experiment.transmission is not None
-    law = [name for name in ("half_gap", "stiffness") if name in experiment.transmission.truth()]
-    return [*law, "coulomb", "viscous"], law
+    return [name for name in _LAW_UNITS if name in experiment.transmission.truth()]
 
 
 def watch_columns(task: WatchTask) -> list[str]:
     """Return the columns of `watch.csv`."""
-    names, law = _number_names(task.experiment)
+    law = _list_law_numbers(task.experiment)
     columns = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
     columns += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction", "blind"]
-    by_side = itertools.product(task.experiment.sides, names, ("", "_error"))
+    by_side = itertools.product(task.experiment.sides, [*law, *_FRICTION_UNITS], ("", "_error"))
     return [*columns, *(f"{side}.{name}{end}" for side, name, end in by_side)]
 
 
@@ -309,7 +310,7 @@ class Watcher:
         experiment = task.experiment
         self._period = float(experiment.run.sample_period)
         self.chain, self._window = LiveChain(experiment), Window(experiment, task.window)
-        self._names, self._chosen = _number_names(experiment)
+        self._law_numbers = _list_law_numbers(experiment)
         self.columns = watch_columns(task)
         self.values: list[Values] = []
         self.samples = 0
@@ -359,7 +360,7 @@ class Watcher:
         values: Values = dict.fromkeys(self.columns, math.nan) | {"t": now, "side": ""}
         values |= {"alarm": False, "contradiction": False, "blind": False}
         for side, window in windows.items():
-            for name in self._names:
+            for name in [*self._law_numbers, *_FRICTION_UNITS]:
                 number = window.numbers[name]
                 values |= {f"{side}.{name}": number.value, f"{side}.{name}_error": number.standard_error}
         values |= self._judge_gap(windows)
@@ -373,7 +374,7 @@ class Watcher:
 
     def _judge_gap(self, windows: dict[str, SideNumbers]) -> Values:
         """Choose the side that determines gap or stiffness best, and decide on the alarm."""
-        task, name = self._task, self._chosen[0]
+        task, name = self._task, self._law_numbers[0]
         law = task.experiment.transmission
         assert law is not None
         nominal = float(getattr(law, name))
@@ -386,14 +387,14 @@ class Watcher:
             return {}
         side = min(numbers_by_side, key=lambda side: numbers_by_side[side][name].standard_error)
         values: Values = {"side": side}
-        for key in self._chosen:
+        for key in self._law_numbers:
             number = numbers_by_side[side][key]
-            low, high = student_interval(number.value, number.standard_error, BLOCKS - 1)
-            values |= {key: number.value, f"{key}_from": low, f"{key}_to": high}
+            reach = INTERVAL * number.standard_error
+            values |= {key: number.value, f"{key}_from": number.value - reach, f"{key}_to": number.value + reach}
         differing = [
             key
             for first, second in itertools.combinations(numbers_by_side.values(), 2)
-            for key in self._chosen
+            for key in self._law_numbers
             if _surely_differ(first[key], second[key])
         ]
         values["contradiction"] = bool(differing)
