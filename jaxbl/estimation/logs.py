@@ -292,7 +292,7 @@ def arrays(values: Mapping[str, float]) -> dict[str, np.ndarray]:
     return {path: np.asarray(value, float) for path, value in values.items()}
 
 
-def run_of(config: Config, record: Record) -> dict[str, float]:
+def run_of(config: Config, record: Record) -> dict[str, Any]:
     """`sample_period` and `substeps` of the record: its period, and plant steps no longer than the study's."""
     step = config.run.sample_period / config.run.substeps
     substeps = max(int(np.ceil(record.sample_period / step * (1.0 - 1e-9))), 1)
@@ -302,16 +302,10 @@ def run_of(config: Config, record: Record) -> dict[str, float]:
 def on_record(config: Config, record: Record) -> Experiment:
     """The study's experiment at the record's period, with plant steps no longer than the study's, and without excitation:
     the input is the record's."""
-    run = run_of(config, record)
     experiment = prepare(config.with_keys("run", precision="float64"))
-    return replace(
-        experiment,
-        # along a log nothing asks for these; programs are compiled for one
-        excitation=as_arrays(Sine(0.0, 1.0), float),
-        run=replace(
-            experiment.run, sample_period=np.asarray(run["sample_period"], float), steps=1, substeps=run["substeps"]
-        ),
-    )
+    # along a log nothing asks for excitation and steps; programs are compiled for one of them
+    run = run_of(config, record) | {"sample_period": np.asarray(record.sample_period, float), "steps": 1}
+    return replace(experiment, excitation=as_arrays(Sine(0.0, 1.0), float), run=replace(experiment.run, **run))
 
 
 def default_paths(config: Config, experiment: Experiment) -> list[str]:
