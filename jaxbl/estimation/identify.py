@@ -188,7 +188,7 @@ def _from_motor(
             # follows from a number that was not found
             summary["parameters"].pop("transmission.half_gap", None)
     if task.holdout is not None:
-        summary["holdout"] = alone_on_holdout(task.holdout.open(), alone)
+        summary["holdout"] = alone_on_holdout(task.holdout.open(), alone, np.zeros(len(free)))
     done()
     return Identification(
         config, with_values(config, alone.values), record, to_jsonable(summary), trace, "excitation" in task.missing

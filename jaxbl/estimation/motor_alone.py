@@ -16,12 +16,12 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import percent
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import Record
 
 from .free_parameters import FreeParameter
 from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
-from .log_columns import join_columns, motion_columns
+from .log_columns import join_columns, motion_columns, recorded_columns
 from .logs import LogTask, arrays
 from .regression import balance, transmit
 from .search import SearchFit
@@ -143,7 +143,7 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
             f"the readings are met without one, and as well by a motor that, within a gap, never meets the load; {both_ways}"
         )
     if not gap.is_needed:
-        if gap.at_most >= gap.travel:
+        if gap.at_most >= model.travel:
             return f"any half gap fits; {both_ways}"
         if gap.crossings < _REVERSALS:
             return f"the torque in the gear hardly changes its sign; {both_ways}"
@@ -162,7 +162,7 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
         numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
         return f"the log is met only with numbers far from the nominal ones ({numbers}); check these, or the log"
     if not gap.spread.deviations[model.gap] < UNSEEN:
-        return f"one would be met, but of any size up to {gap.travel:.3g} {unit}; {both_ways}"
+        return f"one would be met, but of any size up to {model.travel:.3g} {unit}; {both_ways}"
     return ""
 
 
@@ -191,7 +191,6 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     what the model says of the load and of the torque in the gear (`load.modelled_position`, `load.modelled_velocity`,
     `torque`), with the same torque by the motor's side (`torque_by_motor`); NaN in parts of the log that are too short.
     """
-    assert record.torque is not None
     fitted, model, pieces = alone.experiment, alone.model, []
     for segment, state in zip(model.segments, model.states(alone.point), strict=True):
         k, state = segment.kinematics, jax.tree.map(jnp.asarray, state)
@@ -212,8 +211,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
                 "torque_by_motor": balance(fitted, motion)["motor"].residual,
             }
         )
-    columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
-    return columns | join_columns(len(record.time), model.segments, pieces)
+    return recorded_columns(record, ["motor"]) | join_columns(len(record.time), model.segments, pieces)
 
 
 def gap_summary(alone: Alone) -> JsonObject | None:
@@ -236,17 +234,12 @@ def gap_summary(alone: Alone) -> JsonObject | None:
     }
 
 
-def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
-    """Predict another log of the motor by the fitted numbers, and by the nominal ones.
-
-    `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.
-    """
+def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray) -> JsonObject:
+    """Predict another log of the motor by the fitted numbers, and by the nominal ones, whose theta is of shape (free,)."""
     fitted, smoothness = alone.model, alone.point.smoothness
     segments = segments_of(record, ["motor"], fitted.at_rest)
     model = dataclasses.replace(fitted, experiment=at_period(fitted.experiment, record.sample_period), segments=segments)
-    if nominal is None:
-        nominal = np.zeros(len(model.free))
-    after, before = (float(np.sqrt(model.predict(theta, smoothness).variance)) for theta in (alone.point.theta, nominal))
+    after, before = (model.predict(theta, smoothness).variance ** 0.5 for theta in (alone.point.theta, nominal))
     position = describe_position(record, "motor", model.noise, rms=after, nominal_rms=before)
     window = max(map(len, segments)) * record.sample_period
     return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}
