@@ -129,11 +129,17 @@ def read_logs(
         raise InputError("no log: at least one is needed")
     read = partial(_read_one, seeks_delay=seeks_delay, share=share)
     records = [read(config, log) for log in several]
-    config = _at_one_period(config, records, like)
-    records = [
-        record if _alike(record.sample_period, config.log.resample or record.sample_period) else read(config, log)
-        for log, record in zip(several, records, strict=True)
-    ]
+    periods = [record.sample_period for record in records]
+    longest = max(periods)
+    if like is not None and _is_longer(like.sample_period, longest):
+        longest = like.sample_period
+    # those that differ by more than rounding are read again
+    differ = [not math.isclose(period, longest, rel_tol=1e-6) for period in periods]
+    if any(differ):
+        config = config.with_keys("log", resample=longest)
+        records = [
+            read(config, log) if again else record for log, record, again in zip(several, records, differ, strict=True)
+        ]
     shared: dict[str, float] = {}
     for record in [*reversed(records)] if like is None else [like]:
         shared |= record.corrections
@@ -155,22 +161,6 @@ def read_logs(
 def _is_longer(period: float, other: float) -> bool:
     """Return True if a sampling period (s) is longer than another one, by enough to change results."""
     return period > other and not math.isclose(period, other, rel_tol=_NEAR)
-
-
-def _alike(period: float, other: float) -> bool:
-    """Return True if two sampling periods (s) are the same but for rounding."""
-    return math.isclose(period, other, rel_tol=1e-6)
-
-
-def _at_one_period(config: Config, records: Sequence[Record], like: Record | None) -> Config:
-    """The study with `[log] resample` where logs are not sampled alike."""
-    periods = [record.sample_period for record in records]
-    longest = max(periods)
-    if like is not None and _is_longer(like.sample_period, longest):
-        longest = like.sample_period
-    if all(_alike(period, longest) for period in periods):
-        return config
-    return config.with_keys("log", resample=longest)
 
 
 def read_with_holdout(
