@@ -16,7 +16,7 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
 from .free_parameters import set_free_parameters
-from .intervals import NORMAL, Profile, Refusal, interval
+from .intervals import NORMAL, Profile, interval
 from .logs import LogTask, decimation
 from .regression import Kinematics, MotionShare, decimate_balances
 from .search import SearchFit, is_noise
@@ -143,8 +143,8 @@ def summary_of(
         "parameters": _parameters(record, search_fit, profiles) | _derive_numbers(fitted, search_fit),
         "correlation": {"parameters": [parameter.path for parameter in search_fit.free], "matrix": correlation},
         "refused": [
-            {"direction": refusal.direction, "why": _explain_refusal(refusal), "relative_deviation": refusal.deviation}
-            for refusal in search_fit.refused
+            {"direction": direction, "why": why or _explain_refusal(direction, deviation), "relative_deviation": deviation}
+            for direction, deviation, why in search_fit.refused
         ],
         "held": search_fit.held,
         "condition": search_fit.condition,
@@ -180,12 +180,12 @@ _SHOWN_BY = {
 """End of a number's path -> what motion, or what else, would show it."""
 
 
-def _explain_refusal(refusal: Refusal) -> str:
-    names = list(refusal.direction)
+def _explain_refusal(direction: dict[str, float], deviation: float) -> str:
+    names = list(direction)
     text = f"this log hardly depends on {names[0]}"
     if len(names) > 1:
         text = "this log depends hardly on these changing together, by the shares given"
     shown_by = dict.fromkeys(_SHOWN_BY[key] for path in names for key in _SHOWN_BY if path.endswith(key))
     helps = f"; what would help: {', or '.join(shown_by)}" if shown_by else ""
-    size = f"{100.0 * refusal.deviation:.0f} %" if refusal.deviation < 100.0 else "anything"
+    size = f"{100.0 * deviation:.0f} %" if deviation < 100.0 else "anything"
     return f"{text}: it leaves {size} open (standard deviation){helps}"

@@ -103,12 +103,11 @@ def alone_of(
     values, reason = model.numbers(point.theta), ""
     if gap is not None and model.gap is not None:
         # what is said of the gap is said of the model that is left
-        gap = gap._replace(best=point, spread=width) if gap.is_needed else gap._replace(without=point)
-        reason = why_not(gap, model, spread, record)
+        reason = why_not(gap, model, point, width.deviations[model.gap], spread, record)
         absent = [*absent, model.gap] if reason else absent
         if not gap.is_needed:
             values[model.free[model.gap].path] = 0.0
-    return Alone(_describe_fit(model, point, width, {*absent}), values, gap, reason, model, point)
+    return Alone(_describe_fit(model, point, width, {*absent}, reason), values, gap, reason, model, point)
 
 
 _FACTOR, _LEFT = 6.0, 0.05
@@ -132,11 +131,12 @@ def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     )
 
 
-def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
-    """Why a log does not show a gap, and what would, in one clause; "" where it does."""
+def why_not(gap: Gap, model: UnseenLoad, point: Point, deviation: float, spread: float, record: Record) -> str:
+    """Why a log does not show a gap by the best fit, whose theta has this standard error of the gap, and what would, in one
+    clause; "" where it does. `spread`: as of :func:`alone_of`."""
     unit = record.unit_of("motor.position", "rad")
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
-    if wrong := not_met(model, gap.best if gap.is_needed else gap.without, record):
+    if wrong := not_met(model, point, record):
         return wrong
     if gap.unmet:
         return (
@@ -155,22 +155,23 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
         return f"the motor moves as if in a gap, but meets one flank at most: it is wider than this motion; {both_ways}"
     far = {
         number.path: float(np.exp(x))
-        for number, x in zip(model.free, gap.best.theta, strict=True)
+        for number, x in zip(model.free, point.theta, strict=True)
         if is_known(number) and abs(x) > _FAR * np.log(spread)
     }
     if far:
         numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
         return f"the log is met only with numbers far from the nominal ones ({numbers}); check these, or the log"
-    if not gap.spread.deviations[model.gap] < UNSEEN:
+    if not deviation < UNSEEN:
         return f"one would be met, but of any size up to {model.travel:.3g} {unit}; {both_ways}"
     return ""
 
 
-def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collection[int]) -> SearchFit:
+def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collection[int], reason: str) -> SearchFit:
     """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
     sought = np.setdiff1d(np.arange(len(model.free)), [*absent])
     width_sought = width.only(sought)
     refused, condition = refusals([model.free[i] for i in sought], width_sought)
+    unfound = [Refusal({model.free[i].path: 1.0}, np.inf, reason if i == model.gap else "") for i in absent]
     visible = sought[width_sought.deviations < UNSEEN]
     torque = np.concatenate([segment.torque for segment in model.segments])
     # all of the log as one window, without a state of its own
@@ -181,7 +182,7 @@ def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collec
         free=tuple(model.free[i] for i in visible), fit=fit,
         spread=width.only(visible)._replace(variance=point.variance / model.noise**2),
         windows=windows, smoothness={"motor": point.smoothness},
-        refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
+        refused=[*unfound, *refused],
         condition=condition, steps=model.experiment.run.substeps,
     )  # fmt: skip
 
@@ -224,7 +225,7 @@ def gap_summary(alone: Alone) -> JsonObject | None:
         "shown": not alone.reason,
         "path": number.path,
         "nominal": number.nominal * half_gap_of(number),
-        "half_gap": None if alone.reason else model.half_gap(gap.best.theta),
+        "half_gap": None if alone.reason else model.half_gap(alone.point.theta),
         "at_most": gap.at_most,
         "unmet": gap.unmet,
         "gain": gap.gain,

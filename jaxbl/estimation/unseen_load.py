@@ -163,13 +163,11 @@ class UnseenLoad:
 
         From a friction that is too large no way leads back: the load sticks, and nothing depends on it.
         """
-        rows = []
-        for k in (segment.kinematics for segment in self.segments):
-            speed = k.velocity["motor"]
-            rows.append(np.stack([k.acceleration["motor"], speed, np.sign(speed), np.ones(len(speed)), k.torque], axis=1))
-        moving = np.concatenate(rows)
-        moving = moving[np.abs(moving[:, 1]) > 0.1 * self._speed]
-        coefficients = np.linalg.lstsq(moving[:, :-1], moving[:, -1], rcond=None)[0]
+        motions = [segment.kinematics for segment in self.segments]
+        rows = np.concatenate([[k.torque, k.acceleration["motor"], k.velocity["motor"]] for k in motions], axis=1)
+        torque, acceleration, speed = rows[:, np.abs(rows[2]) > 0.1 * self._speed]
+        columns = np.stack([acceleration, speed, np.sign(speed), np.ones_like(speed)], axis=1)
+        coefficients = np.linalg.lstsq(columns, torque, rcond=None)[0]
         least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
         total, thetas = np.maximum(coefficients[1:3], least), np.zeros((len(_SHARES), len(self.free)))
         viscous = {"drive.motor_viscous": "motor", "drive.load_viscous": "load"}
