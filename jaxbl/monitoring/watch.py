@@ -427,7 +427,7 @@ def _summarise(
         "file": str(Path(task.name).resolve()) if "://" not in task.name else task.name,
         "samples": watcher.samples,
         "sample_period": task.period,
-        "start": (0.0 if watcher.start is None else watcher.start) + (0.0 if task.record is None else task.record.start),
+        "start": (watcher.start or 0.0) + (0.0 if task.record is None else task.record.start),
         "window": task.window,
         "every": task.interval,
         "alarm_gap": task.alarm_gap,
