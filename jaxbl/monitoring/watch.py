@@ -249,7 +249,6 @@ def run_watch(
     with jax.enable_x64(True), limit_blas_threads():
         watcher = Watcher(task, on_values or (lambda values: None))
         counts: Mapping[str, int] = {}
-        notes: list[str] = []
         if (record := task.record) is None:
             counts = _watch_stream(watcher, task, ended or (lambda: False), on_remark or (lambda text: None))
         else:
@@ -257,9 +256,8 @@ def run_watch(
             for part in record.segments:
                 positions = {side: values[part] for side, values in record.positions.items()}
                 watcher.take(Rows(float(record.time[part.start]), record.torque[part], positions, True))
-            notes += [*record.warnings, *record.notes]
     values = pd.DataFrame(watcher.values, columns=task.columns)
-    return Watch(task, to_jsonable(_summarise(task, watcher, values, counts, notes)), values)
+    return Watch(task, to_jsonable(_summarise(task, watcher, values, counts)), values)
 
 
 def _watch_stream(
@@ -413,10 +411,8 @@ def _surely_differ(first: Quantity, second: Quantity) -> bool:
     return abs(first.value - second.value) > _BOUND * math.hypot(first.standard_error, second.standard_error)
 
 
-def _summarise(
-    task: WatchTask, watcher: Watcher, values: pd.DataFrame, counts: Mapping[str, int], notes: list[str]
-) -> JsonObject:
-    determined = values[values["side"] != ""]
+def _summarise(task: WatchTask, watcher: Watcher, values: pd.DataFrame, counts: Mapping[str, int]) -> JsonObject:
+    record, determined = task.record, values[values["side"] != ""]
     alarms = determined[determined["alarm"].astype(bool)]
 
     def list_numbers(rows: Any, i: int) -> Values | None:
@@ -427,7 +423,7 @@ def _summarise(
         "file": str(Path(task.name).resolve()) if "://" not in task.name else task.name,
         "samples": watcher.samples,
         "sample_period": task.period,
-        "start": (watcher.start or 0.0) + (0.0 if task.record is None else task.record.start),
+        "start": (watcher.start or 0.0) + (0.0 if record is None else record.start),
         "window": task.window,
         "every": task.interval,
         "alarm_gap": task.alarm_gap,
@@ -441,7 +437,7 @@ def _summarise(
         "last": list_numbers(determined, -1),
         "units": task.units,
         "left_out": dict(counts),
-        "notes": notes,
+        "notes": [] if record is None else [*record.warnings, *record.notes],
     }
 
 
