@@ -58,7 +58,7 @@ def fit_numbers(experiment, free, windows):
 
 def cut_windows(torque, readings, samples):
     smoothed = smooth(jnp.asarray(readings["motor"]), PERIOD)
-    start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ())
+    start = PlantState({"motor": smoothed.state[:, 0]}, {"motor": smoothed.velocity}, ())
     return cut(torque, readings, PERIOD, start, {"motor": 1e-4}, samples)
 
 

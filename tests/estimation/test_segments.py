@@ -40,7 +40,7 @@ def test_windows_begin_with_the_torque_that_the_actuator_makes_then(lagged_log):
     actuator_torque[0] = record.torque[0]
     ((result,),) = windows.start.effects
     np.testing.assert_allclose(result, actuator_torque[windows.rows], atol=1e-3 * np.max(np.abs(actuator_torque)))
-    np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].position[windows.rows])
+    np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].state[windows.rows, 0])
 
 
 def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(lagged_log):
