@@ -53,9 +53,7 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     pieces = []
     for segment in segments:
         deviation = {side: smoothed.deviation(1) for side, smoothed in segment.smoothed.items()}
-        torques = model_torques(fitted, segment.kinematics, deviation)
-        named = {"torque" if name == "transmission" else f"{name}.effects": torque for name, torque in torques.items()}
-        pieces.append(motion_columns(segment) | named)
+        pieces.append(motion_columns(segment) | model_torques(fitted, segment.kinematics, deviation))
     rows = (search_fit.windows.rows[:, None] + np.arange(search_fit.samples)).ravel()
     for i, side in enumerate(fitted.sides):
         column = columns[f"{side}.residual"] = np.full(len(record.time), np.nan)

@@ -86,8 +86,9 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
 
 
 @jit
-def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: SideSamples) -> SideSamples:
-    """Torques by a model at known kinematics, N m: `transmission`, and what effects take on each side that has any.
+def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: SideSamples) -> dict[str, Samples]:
+    """Torques by a model at known kinematics, N m: `torque` in the gear, and `SIDE.effects`, what effects take there if the
+    side has any.
 
     Within the standard deviation of the velocities, rad/s, dry friction goes through zero.
     """
@@ -95,8 +96,8 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
     states, torque = effect_path(experiment, k)
     loaded: Any = 0.0
     if plant.transmission is not None:
-        torques["transmission"] = transmit(plant, k, states)
-        loaded = plant.gear_friction(states, torques["transmission"])
+        torques["torque"] = transmit(plant, k, states)
+        loaded = plant.gear_friction(states, torques["torque"])
     none = jnp.zeros_like(k.torque)
     acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, none)
     places = {plant.drive.resolve_place(effect.place) for effect in plant.effects}
@@ -108,7 +109,7 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
         commanded, more = (k.torque, loaded) if side == "motor" else (0.0, 0.0)
         direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
         added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
-        torques[side] = (level + more) * direction + commanded - total + added
+        torques[f"{side}.effects"] = (level + more) * direction + commanded - total + added
     return torques
 
 

@@ -72,11 +72,13 @@ def test_balance_is_the_equations_of_motion():
     torques = model_torques(
         experiment, Kinematics(T, u, position, velocity, acceleration), {s: jnp.full_like(T, 1e-9) for s in velocity}
     )
-    np.testing.assert_allclose(torques["transmission"], c, atol=1e-9)
+    np.testing.assert_allclose(torques["torque"], c, atol=1e-9)
     moving = jnp.abs(velocity["motor"]) > 1e-6
-    np.testing.assert_allclose((torques["motor"] - 0.3 * jnp.sign(velocity["motor"]) + 0.1 * u)[moving], 0.0, atol=1e-9)
     np.testing.assert_allclose(
-        torques["load"], 2.0 * jnp.sin(position["load"] - 0.1) + 0.7 * acceleration["load"], atol=1e-9
+        (torques["motor.effects"] - 0.3 * jnp.sign(velocity["motor"]) + 0.1 * u)[moving], 0.0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        torques["load.effects"], 2.0 * jnp.sin(position["load"] - 0.1) + 0.7 * acceleration["load"], atol=1e-9
     )
 
 
