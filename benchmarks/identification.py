@@ -36,10 +36,10 @@ from jaxbl.config import prepare, read_model  # noqa: E402
 from jaxbl.drive.parameters import set_leaves  # noqa: E402
 from jaxbl.estimation import identify as identify_module, log_columns  # noqa: E402
 from jaxbl.estimation.free_parameters import make_free_parameters  # noqa: E402
+from jaxbl.estimation.identification_summary import torque_errors  # noqa: E402
 from jaxbl.estimation.intervals import spread  # noqa: E402
 from jaxbl.estimation.logs import arrays, on_record  # noqa: E402
 from jaxbl.estimation.observer_gains import gains_for  # noqa: E402
-from jaxbl.estimation.regression import errors  # noqa: E402
 from jaxbl.estimation.search import ParameterSearch  # noqa: E402
 from jaxbl.estimation.segments import segments_of  # noqa: E402
 from jaxbl.records import read_record  # noqa: E402
@@ -262,7 +262,7 @@ def emps_table():
     lines.append("| --- |" + " ---: |" * 6)
     for method, values in estimates.items():
         fitted = set_leaves(experiment, {path: jnp.asarray(value) for path, (value, _) in values.items()})
-        left = [100.0 * errors(fitted, [part], 10)["motor"]["relative"] for part in parts]
+        left = [100.0 * torque_errors(estimation, fitted, [part], 10)["motor"]["relative"] for part in parts]
         cells = [
             f"{values[path][0]:.2f}" + (f" ± {values[path][1]:.2f}" if np.isfinite(values[path][1]) else "")
             if path in values

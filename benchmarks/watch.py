@@ -66,9 +66,10 @@ def simulate_rows(config: Config, gaps: np.ndarray, seeds: np.ndarray, noise: fl
 def watch_rows(model: Config, rows: list[np.ndarray], window: float) -> Any:
     """Values over time of one run."""
     with jax.enable_x64(True):
-        watcher = Watcher(read_watch_task(ADDRESS, model, window=window), lambda values: None)
+        task = read_watch_task(ADDRESS, model, window=window)
+        watcher = Watcher(task, lambda values: None)
         watcher.take(Rows(0.0, rows[0], {"motor": rows[1], "load": rows[2]}, True))
-    return {name: np.array([window_values[name] for window_values in watcher.values]) for name in watcher.columns}
+    return {name: np.array([window_values[name] for window_values in watcher.values]) for name in task.columns}
 
 
 def half_gap_of(config: Config) -> float:

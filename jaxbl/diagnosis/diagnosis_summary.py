@@ -15,11 +15,11 @@ from jaxbl.config import Config, read_config, with_values
 from jaxbl.drive.effects import EFFECTS, Numbers
 from jaxbl.drive.parameters import units_of
 from jaxbl.estimation.free_parameters import FreeParameter, free_values
-from jaxbl.estimation.log_columns import join_columns
+from jaxbl.estimation.log_columns import join_columns, recorded_columns
 from jaxbl.estimation.logs import run_of
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import Record
 
 from .candidates import EffectNumbers, are_possible
 from .choice import Chosen
@@ -241,8 +241,7 @@ def trace_of(
     """
     task = setup.task
     joined = task.record if task.separate else proof.record
-    columns: JsonObject = {"t": joined.time, "u": joined.torque}
-    columns |= {POSITION_CHANNELS[side]: joined.positions[side] for side in POSITION_CHANNELS if side in joined.positions}
+    columns = recorded_columns(joined, joined.positions)
     if setup.nominal.transmission is not None:
         columns["twist"] = setup.nominal.plant.twist(joined.positions)
     columns["held_out"] = np.arange(len(joined.time)) >= len(task.record.time)

@@ -145,7 +145,7 @@ class ReferenceLog:
         force = max(np.max(np.abs(segment.torque)) for segment in self.segments) * float(experiment.plant.input_gain)
         free = 0.5 * abs(force) / float(experiment.plant.inertia("motor")) * (self.samples * self.period) ** 2
         experiment, _ = with_torques(experiment)
-        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.at_rest)[0])
+        windows = jax.tree.map(np.asarray, windows_of(self.segments, experiment, self.samples, self.at_rest))
         simulated = simulate_plants(*lean(experiment, windows.start), windows.torque, windows.time).position
         departures = {}
         for side in experiment.sides:
@@ -257,9 +257,9 @@ class ReferenceLog:
         """Runs on the windows of a part, and the row that each begins with."""
         # the loop of steps is that of linearisations, which have these torques
         experiment, _ = with_torques(at_period(experiment, self.period))
-        windows, firsts = windows_of(self.segments, experiment, self.samples, self.at_rest)
-        indices = _rows_of(len(firsts), part)
-        return best_runs(experiment, windows, _STATES, self.at_rest, indices), firsts[indices]
+        windows = windows_of(self.segments, experiment, self.samples, self.at_rest)
+        indices = _rows_of(len(windows.rows), part)
+        return best_runs(experiment, windows, _STATES, self.at_rest, indices), windows.rows[indices]
 
 
 def parts_of_blocks(parts: int) -> np.ndarray:

@@ -16,18 +16,22 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
 from .free_parameters import set_free_parameters
-from .intervals import NORMAL, Profile, Refusal, interval
+from .intervals import NORMAL, Profile, interval
 from .logs import LogTask, decimation
-from .regression import Kinematics, MotionShare, errors
+from .regression import Kinematics, MotionShare, decimate_balances
 from .search import SearchFit, is_noise
 from .segments import at_period, long_enough, segments_of, windows_of
 from .trajectory import eliminate_starts
 
 
 def torque_errors(record: Record, experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, JsonObject]:
-    """Measure how far a model misses the torques of a log after decimation, by equation, with units."""
-    equations = errors(experiment, parts, factor)
-    return {name: figures | {"unit": record.unit_of(name, "N m")} for name, figures in equations.items()}
+    """Measure how far a model misses the torques of a log after decimation, rms and relative to the driving torque."""
+    figures = {}
+    for name, equation in decimate_balances(experiment, parts, factor).items():
+        left, drive = (rms(np.asarray(torque)) for torque in equation)
+        relative = left / drive if drive > 0.0 else float("nan")
+        figures[name] = {"rms": left, "relative": relative, "unit": record.unit_of(name, "N m")}
+    return figures
 
 
 def describe_position(record: Record, side: str, noise: float, **errors: float) -> JsonObject:
@@ -40,7 +44,7 @@ def on_holdout(config: Config, record: Record, nominal: Experiment, fitted: Expe
     rebased = [at_period(model, record.sample_period) for model in (nominal, fitted)]
     at_rest = config.log.initial_state == "rest"
     segments = segments_of(record, nominal.sides, at_rest)
-    windows, _ = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
+    windows = windows_of(segments, nominal, min(samples, max(map(len, segments))), at_rest)
     left = [eliminate_starts(model, windows).residual for model in rebased]
     position = {}
     for i, side in enumerate(nominal.sides):
@@ -102,7 +106,7 @@ def _by_trajectories(search_fit: SearchFit, record: Record) -> JsonObject:
     return {
         "kind": "prediction_error" if search_fit.smoothness else "output_error",
         "window": search_fit.samples * record.sample_period,
-        "windows": len(search_fit.firsts),
+        "windows": len(search_fit.windows.rows),
         "converged": search_fit.fit.converged,
         "starts": len(search_fit.starts),
         "starts_agreeing": sum(search_fit.starts),
@@ -139,8 +143,8 @@ def summary_of(
         "parameters": _parameters(record, search_fit, profiles) | _derive_numbers(fitted, search_fit),
         "correlation": {"parameters": [parameter.path for parameter in search_fit.free], "matrix": correlation},
         "refused": [
-            {"direction": refusal.direction, "why": _explain_refusal(refusal), "relative_deviation": refusal.deviation}
-            for refusal in search_fit.refused
+            {"direction": direction, "why": why or _explain_refusal(direction, deviation), "relative_deviation": deviation}
+            for direction, deviation, why in search_fit.refused
         ],
         "held": search_fit.held,
         "condition": search_fit.condition,
@@ -176,12 +180,12 @@ _SHOWN_BY = {
 """End of a number's path -> what motion, or what else, would show it."""
 
 
-def _explain_refusal(refusal: Refusal) -> str:
-    names = list(refusal.direction)
+def _explain_refusal(direction: dict[str, float], deviation: float) -> str:
+    names = list(direction)
     text = f"this log hardly depends on {names[0]}"
     if len(names) > 1:
         text = "this log depends hardly on these changing together, by the shares given"
     shown_by = dict.fromkeys(_SHOWN_BY[key] for path in names for key in _SHOWN_BY if path.endswith(key))
     helps = f"; what would help: {', or '.join(shown_by)}" if shown_by else ""
-    size = f"{100.0 * refusal.deviation:.0f} %" if refusal.deviation < 100.0 else "anything"
+    size = f"{100.0 * deviation:.0f} %" if deviation < 100.0 else "anything"
     return f"{text}: it leaves {size} open (standard deviation){helps}"

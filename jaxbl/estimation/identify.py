@@ -180,15 +180,11 @@ def _from_motor(
     trace = pd.DataFrame(columns_alone(record, alone))
     summary, gap = summary_of(task, alone.experiment, alone.search_fit), gap_summary(alone)
     summary["torque"], summary["backlash"] = {}, gap
-    if gap is not None and gap["why"]:
-        for refusal in summary["refused"]:
-            if gap["path"] in refusal["direction"]:
-                refusal["why"] = gap["why"]
-        if gap["path"].startswith("transmission."):
-            # follows from a number that was not found
-            summary["parameters"].pop("transmission.half_gap", None)
+    if gap is not None and gap["why"] and gap["path"].startswith("transmission."):
+        # follows from a number that was not found
+        summary["parameters"].pop("transmission.half_gap", None)
     if task.holdout is not None:
-        summary["holdout"] = alone_on_holdout(task.holdout.open(), alone)
+        summary["holdout"] = alone_on_holdout(task.holdout.open(), alone, np.zeros(len(free)))
     done()
     return Identification(
         config, with_values(config, alone.values), record, to_jsonable(summary), trace, "excitation" in task.missing

@@ -1,6 +1,6 @@
 """Columns over a log: its smoothed motion, the fit's residuals, the fitted model's torques, and what the observers see."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,13 @@ def join_columns(count: int, segments: Sequence[Segment], pieces: Sequence[Mappi
     return columns
 
 
+def recorded_columns(record: Record, sides: Collection[str]) -> NamedArrays:
+    """Columns of a log as it was read: `t`, `u`, and positions (`theta_e`, ...) of some sides."""
+    assert record.torque is not None
+    positions = {channel: record.positions[side] for side, channel in POSITION_CHANNELS.items() if side in sides}
+    return {"t": record.time, "u": record.torque} | positions
+
+
 def motion_columns(segment: Segment) -> NamedArrays:
     """Columns of each side's smoothed motion along a segment, with deviations."""
     columns: NamedArrays = {}
@@ -40,18 +47,14 @@ def columns_of(record: Record, segments: Sequence[Segment], fitted: Experiment, 
     `t`, `u`, positions (`theta_e`, ...), `transmitted` where it was measured; `SIDE.velocity` and `SIDE.acceleration` with
     their deviations; `SIDE.residual`, rad; the model's `torque` and `SIDE.effects`, N m.
     """
-    assert record.torque is not None
-    columns = {"t": record.time, "u": record.torque}
-    columns |= {POSITION_CHANNELS[side]: record.positions[side] for side in fitted.sides}
+    columns = recorded_columns(record, fitted.sides)
     if record.transmitted is not None:
         columns["transmitted"] = record.transmitted
     pieces = []
     for segment in segments:
         deviation = {side: smoothed.deviation(1) for side, smoothed in segment.smoothed.items()}
-        torques = model_torques(fitted, segment.kinematics, deviation)
-        named = {"torque" if name == "transmission" else f"{name}.effects": torque for name, torque in torques.items()}
-        pieces.append(motion_columns(segment) | named)
-    rows = (search_fit.firsts[:, None] + np.arange(search_fit.samples)).ravel()
+        pieces.append(motion_columns(segment) | model_torques(fitted, segment.kinematics, deviation))
+    rows = (search_fit.windows.rows[:, None] + np.arange(search_fit.samples)).ravel()
     for i, side in enumerate(fitted.sides):
         column = columns[f"{side}.residual"] = np.full(len(record.time), np.nan)
         column[rows] = search_fit.windows.noise[side] * search_fit.fit.residual[:, :, i].ravel()

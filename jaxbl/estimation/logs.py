@@ -129,11 +129,17 @@ def read_logs(
         raise InputError("no log: at least one is needed")
     read = partial(_read_one, seeks_delay=seeks_delay, share=share)
     records = [read(config, log) for log in several]
-    config = _at_one_period(config, records, like)
-    records = [
-        record if _alike(record.sample_period, config.log.resample or record.sample_period) else read(config, log)
-        for log, record in zip(several, records, strict=True)
-    ]
+    periods = [record.sample_period for record in records]
+    longest = max(periods)
+    if like is not None and _is_longer(like.sample_period, longest):
+        longest = like.sample_period
+    # those that differ by more than rounding are read again
+    differ = [not math.isclose(period, longest, rel_tol=1e-6) for period in periods]
+    if any(differ):
+        config = config.with_keys("log", resample=longest)
+        records = [
+            read(config, log) if again else record for log, record, again in zip(several, records, differ, strict=True)
+        ]
     shared: dict[str, float] = {}
     for record in [*reversed(records)] if like is None else [like]:
         shared |= record.corrections
@@ -155,22 +161,6 @@ def read_logs(
 def _is_longer(period: float, other: float) -> bool:
     """Return True if a sampling period (s) is longer than another one, by enough to change results."""
     return period > other and not math.isclose(period, other, rel_tol=_NEAR)
-
-
-def _alike(period: float, other: float) -> bool:
-    """Return True if two sampling periods (s) are the same but for rounding."""
-    return math.isclose(period, other, rel_tol=1e-6)
-
-
-def _at_one_period(config: Config, records: Sequence[Record], like: Record | None) -> Config:
-    """The study with `[log] resample` where logs are not sampled alike."""
-    periods = [record.sample_period for record in records]
-    longest = max(periods)
-    if like is not None and _is_longer(like.sample_period, longest):
-        longest = like.sample_period
-    if all(_alike(period, longest) for period in periods):
-        return config
-    return config.with_keys("log", resample=longest)
 
 
 def read_with_holdout(
@@ -292,7 +282,7 @@ def arrays(values: Mapping[str, float]) -> dict[str, np.ndarray]:
     return {path: np.asarray(value, float) for path, value in values.items()}
 
 
-def run_of(config: Config, record: Record) -> dict[str, float]:
+def run_of(config: Config, record: Record) -> dict[str, Any]:
     """`sample_period` and `substeps` of the record: its period, and plant steps no longer than the study's."""
     step = config.run.sample_period / config.run.substeps
     substeps = max(int(np.ceil(record.sample_period / step * (1.0 - 1e-9))), 1)
@@ -302,16 +292,10 @@ def run_of(config: Config, record: Record) -> dict[str, float]:
 def on_record(config: Config, record: Record) -> Experiment:
     """The study's experiment at the record's period, with plant steps no longer than the study's, and without excitation:
     the input is the record's."""
-    run = run_of(config, record)
     experiment = prepare(config.with_keys("run", precision="float64"))
-    return replace(
-        experiment,
-        # along a log nothing asks for these; programs are compiled for one
-        excitation=as_arrays(Sine(0.0, 1.0), float),
-        run=replace(
-            experiment.run, sample_period=np.asarray(run["sample_period"], float), steps=1, substeps=run["substeps"]
-        ),
-    )
+    # along a log nothing asks for excitation and steps; programs are compiled for one of them
+    run = run_of(config, record) | {"sample_period": np.asarray(record.sample_period, float), "steps": 1}
+    return replace(experiment, excitation=as_arrays(Sine(0.0, 1.0), float), run=replace(experiment.run, **run))
 
 
 def default_paths(config: Config, experiment: Experiment) -> list[str]:

@@ -16,17 +16,17 @@ from jaxbl.drive.parameters import set_leaves
 from jaxbl.errors import InputError
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import percent
-from jaxbl.records import POSITION_CHANNELS, Record
+from jaxbl.records import Record
 
 from .free_parameters import FreeParameter
 from .identification_summary import describe_position
 from .intervals import UNSEEN, Refusal, Spread, refusals
-from .log_columns import join_columns, motion_columns
+from .log_columns import join_columns, motion_columns, recorded_columns
 from .logs import LogTask, arrays
 from .regression import balance, transmit
 from .search import SearchFit
 from .segments import Segment, at_period, segments_of
-from .trajectory import Fit, cut
+from .trajectory import Fit, Windows
 from .unseen_load import SHOWN, Gap, Point, UnseenLoad, find_gap, half_gap_of, is_known, widths
 
 
@@ -103,12 +103,11 @@ def alone_of(
     values, reason = model.numbers(point.theta), ""
     if gap is not None and model.gap is not None:
         # what is said of the gap is said of the model that is left
-        gap = gap._replace(best=point, spread=width) if gap.is_needed else gap._replace(without=point)
-        reason = why_not(gap, model, spread, record)
+        reason = why_not(gap, model, point, width.deviations[model.gap], spread, record)
         absent = [*absent, model.gap] if reason else absent
         if not gap.is_needed:
             values[model.free[model.gap].path] = 0.0
-    return Alone(_describe_fit(model, point, width, {*absent}), values, gap, reason, model, point)
+    return Alone(_describe_fit(model, point, width, {*absent}, reason), values, gap, reason, model, point)
 
 
 _FACTOR, _LEFT = 6.0, 0.05
@@ -132,18 +131,19 @@ def not_met(model: UnseenLoad, point: Point, record: Record) -> str:
     )
 
 
-def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
-    """Why a log does not show a gap, and what would, in one clause; "" where it does."""
+def why_not(gap: Gap, model: UnseenLoad, point: Point, deviation: float, spread: float, record: Record) -> str:
+    """Why a log does not show a gap by the best fit, whose theta has this standard error of the gap, and what would, in one
+    clause; "" where it does. `spread`: as of :func:`alone_of`."""
     unit = record.unit_of("motor.position", "rad")
     both_ways = "moves back and forth that drive the load both ways, wider than the gap, would show one"
-    if wrong := not_met(model, gap.best if gap.is_needed else gap.without, record):
+    if wrong := not_met(model, point, record):
         return wrong
     if gap.unmet:
         return (
             f"the readings are met without one, and as well by a motor that, within a gap, never meets the load; {both_ways}"
         )
     if not gap.is_needed:
-        if gap.at_most >= gap.travel:
+        if gap.at_most >= model.travel:
             return f"any half gap fits; {both_ways}"
         if gap.crossings < _REVERSALS:
             return f"the torque in the gear hardly changes its sign; {both_ways}"
@@ -155,34 +155,34 @@ def why_not(gap: Gap, model: UnseenLoad, spread: float, record: Record) -> str:
         return f"the motor moves as if in a gap, but meets one flank at most: it is wider than this motion; {both_ways}"
     far = {
         number.path: float(np.exp(x))
-        for number, x in zip(model.free, gap.best.theta, strict=True)
+        for number, x in zip(model.free, point.theta, strict=True)
         if is_known(number) and abs(x) > _FAR * np.log(spread)
     }
     if far:
         numbers = ", ".join(f"{path} times {factor:.3g}" for path, factor in far.items())
         return f"the log is met only with numbers far from the nominal ones ({numbers}); check these, or the log"
-    if not gap.spread.deviations[model.gap] < UNSEEN:
-        return f"one would be met, but of any size up to {gap.travel:.3g} {unit}; {both_ways}"
+    if not deviation < UNSEEN:
+        return f"one would be met, but of any size up to {model.travel:.3g} {unit}; {both_ways}"
     return ""
 
 
-def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collection[int]) -> SearchFit:
+def _describe_fit(model: UnseenLoad, point: Point, width: Spread, absent: Collection[int], reason: str) -> SearchFit:
     """The fit of the numbers that the log shows; the others were fitted with them, and their intervals allow for that."""
     sought = np.setdiff1d(np.arange(len(model.free)), [*absent])
     width_sought = width.only(sought)
     refused, condition = refusals([model.free[i] for i in sought], width_sought)
+    unfound = [Refusal({model.free[i].path: 1.0}, np.inf, reason if i == model.gap else "") for i in absent]
     visible = sought[width_sought.deviations < UNSEEN]
     torque = np.concatenate([segment.torque for segment in model.segments])
     # all of the log as one window, without a state of its own
-    windows = cut(torque, {}, model.period, PlantState({}, {}, ()), {"motor": model.noise}, len(torque))
-    residual = (point.errors / model.noise)[None, :, None]
-    none = np.zeros((*residual.shape, 0))
-    fit = Fit(point.theta[visible], windows.start, residual, none, True)
+    no_state, zero = PlantState({}, {}, ()), np.zeros(1, int)
+    windows = Windows(torque[None], {}, zero, no_state, {"motor": model.noise}, zero, np.empty(0), zero)
+    fit = Fit(point.theta[visible], no_state, (point.errors / model.noise)[None, :, None], np.empty(0), True)
     return SearchFit(
         free=tuple(model.free[i] for i in visible), fit=fit,
         spread=width.only(visible)._replace(variance=point.variance / model.noise**2),
-        windows=windows, firsts=np.zeros(1, int), smoothness={"motor": point.smoothness},
-        refused=[*(Refusal({model.free[i].path: 1.0}, np.inf) for i in absent), *refused],
+        windows=windows, smoothness={"motor": point.smoothness},
+        refused=[*unfound, *refused],
         condition=condition, steps=model.experiment.run.substeps,
     )  # fmt: skip
 
@@ -192,7 +192,6 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
     what the model says of the load and of the torque in the gear (`load.modelled_position`, `load.modelled_velocity`,
     `torque`), with the same torque by the motor's side (`torque_by_motor`); NaN in parts of the log that are too short.
     """
-    assert record.torque is not None
     fitted, model, pieces = alone.experiment, alone.model, []
     for segment, state in zip(model.segments, model.states(alone.point), strict=True):
         k, state = segment.kinematics, jax.tree.map(jnp.asarray, state)
@@ -213,8 +212,7 @@ def columns_alone(record: Record, alone: Alone) -> dict[str, np.ndarray]:
                 "torque_by_motor": balance(fitted, motion)["motor"].residual,
             }
         )
-    columns = {"t": record.time, "u": record.torque, POSITION_CHANNELS["motor"]: record.positions["motor"]}
-    return columns | join_columns(len(record.time), model.segments, pieces)
+    return recorded_columns(record, ["motor"]) | join_columns(len(record.time), model.segments, pieces)
 
 
 def gap_summary(alone: Alone) -> JsonObject | None:
@@ -227,7 +225,7 @@ def gap_summary(alone: Alone) -> JsonObject | None:
         "shown": not alone.reason,
         "path": number.path,
         "nominal": number.nominal * half_gap_of(number),
-        "half_gap": None if alone.reason else model.half_gap(gap.best.theta),
+        "half_gap": None if alone.reason else model.half_gap(alone.point.theta),
         "at_most": gap.at_most,
         "unmet": gap.unmet,
         "gain": gap.gain,
@@ -237,17 +235,12 @@ def gap_summary(alone: Alone) -> JsonObject | None:
     }
 
 
-def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray | None = None) -> JsonObject:
-    """Predict another log of the motor by the fitted numbers, and by the nominal ones.
-
-    `nominal`: theta of the model as given where it lacks some of them, shape (free,); left out: zeros.
-    """
+def alone_on_holdout(record: Record, alone: Alone, nominal: np.ndarray) -> JsonObject:
+    """Predict another log of the motor by the fitted numbers, and by the nominal ones, whose theta is of shape (free,)."""
     fitted, smoothness = alone.model, alone.point.smoothness
     segments = segments_of(record, ["motor"], fitted.at_rest)
     model = dataclasses.replace(fitted, experiment=at_period(fitted.experiment, record.sample_period), segments=segments)
-    if nominal is None:
-        nominal = np.zeros(len(model.free))
-    after, before = (float(np.sqrt(model.predict(theta, smoothness).variance)) for theta in (alone.point.theta, nominal))
+    after, before = (model.predict(theta, smoothness).variance ** 0.5 for theta in (alone.point.theta, nominal))
     position = describe_position(record, "motor", model.noise, rms=after, nominal_rms=before)
     window = max(map(len, segments)) * record.sample_period
     return {"file": str(record.path.resolve()), "window": window, "position": {"motor": position}, "torque": {}}

@@ -5,7 +5,7 @@ Reference: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMP
 Identification Benchmarks (2019).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -54,27 +54,6 @@ class Kinematics(Path):
     transmitted: Samples | None = None
 
 
-def kinematics_from(
-    time: np.ndarray,
-    torque: np.ndarray,
-    states: Mapping[str, Any],
-    transmitted: Any = None,
-    before: np.ndarray | None = None,
-) -> Kinematics:
-    """Kinematics of a part of a record.
-
-    The input torque is held from each sample to the next; `states` are position, velocity and acceleration of each side,
-    shape (samples, 3). `before`: input before the first sample, N m, shape (earlier,), where it is known.
-    """
-    before = np.empty(0) if before is None else before
-    held = np.concatenate([before, torque])
-    earlier, mean = np.split(0.5 * (np.append(held[:1], held[:-1]) + held), [len(before)])
-    motion: list[Any] = [{side: np.ascontiguousarray(state[:, i]) for side, state in states.items()} for i in range(3)]
-    # arrays of numpy go where those of jax are asked for
-    arrays: list[Any] = [time, mean, *motion, transmitted]
-    return Kinematics(*arrays, before=earlier if len(earlier) else None)  # pyright: ignore[reportArgumentType]
-
-
 class Balance(NamedTuple):
     """One equation of the drive along a record.
 
@@ -107,8 +86,9 @@ def balance(experiment: Experiment, kinematics: Kinematics) -> dict[str, Balance
 
 
 @jit
-def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: SideSamples) -> SideSamples:
-    """Torques by a model at known kinematics, N m: `transmission`, and what effects take on each side that has any.
+def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: SideSamples) -> dict[str, Samples]:
+    """Torques by a model at known kinematics, N m: `torque` in the gear, and `SIDE.effects`, what effects take there if the
+    side has any.
 
     Within the standard deviation of the velocities, rad/s, dry friction goes through zero.
     """
@@ -116,8 +96,8 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
     states, torque = effect_path(experiment, k)
     loaded: Any = 0.0
     if plant.transmission is not None:
-        torques["transmission"] = transmit(plant, k, states)
-        loaded = plant.gear_friction(states, torques["transmission"])
+        torques["torque"] = transmit(plant, k, states)
+        loaded = plant.gear_friction(states, torques["torque"])
     none = jnp.zeros_like(k.torque)
     acting = jax.vmap(plant.side_torques)(k.position, k.velocity, states, torque, k.time, none)
     places = {plant.drive.resolve_place(effect.place) for effect in plant.effects}
@@ -129,7 +109,7 @@ def model_torques(experiment: Experiment, kinematics: Kinematics, deviation: Sid
         commanded, more = (k.torque, loaded) if side == "motor" else (0.0, 0.0)
         direction = jnp.clip(k.velocity[side] / jnp.maximum(3.0 * deviation[side], jnp.finfo(float).tiny), -1.0, 1.0)
         added = (plant.inertia(side) - plant.drive.inertia(side)) * k.acceleration[side]
-        torques[side] = (level + more) * direction + commanded - total + added
+        torques[f"{side}.effects"] = (level + more) * direction + commanded - total + added
     return torques
 
 
@@ -235,15 +215,6 @@ def decimate_balances(experiment: Experiment, parts: Sequence[Kinematics], facto
     balances = [jit(balance)(experiment, part) for part in parts]
     pieces = jax.tree.map(lambda torque: decimate(torque, factor), balances)
     return jax.tree.map(lambda *torques: jnp.concatenate(torques), *pieces) if pieces else {}
-
-
-def errors(experiment: Experiment, parts: Sequence[Kinematics], factor: int) -> dict[str, dict[str, float]]:
-    """Measure how far a model misses the torques, after decimation: rms in N m, and relative to the driving torque's rms."""
-    figures = {}
-    for name, equation in decimate_balances(experiment, parts, factor).items():
-        left, drive = (float(jnp.sqrt(jnp.mean(torque**2))) for torque in equation)
-        figures[name] = {"rms": left, "relative": left / drive if drive > 0.0 else float("nan")}
-    return figures
 
 
 class MotionShare(NamedTuple):

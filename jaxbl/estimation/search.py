@@ -47,7 +47,6 @@ class SearchFit:
         fit: from the best start.
         spread: its covariance.
         windows: the record as it was fitted.
-        firsts: row that each window begins with.
         smoothness: of each side's predictor; empty for output error.
         steps: plant steps in a sample.
         errors: of theta, that finer steps or windows of another length show, each of shape (parameters,).
@@ -62,7 +61,6 @@ class SearchFit:
     fit: Fit
     spread: Spread
     windows: Windows
-    firsts: np.ndarray
     smoothness: dict[str, float]
     steps: int
     errors: Sequence[np.ndarray] = ()
@@ -147,8 +145,7 @@ class ParameterSearch:
 
         Starts agree with it whose costs are at most 1 % larger; of the cost of noise alone, if that is more.
         """
-        windows, _ = windows_of(self.segments, self.experiment, self.lengths[0], self.at_rest)
-        windows = windows.some(_MOST_COARSE)
+        windows = windows_of(self.segments, self.experiment, self.lengths[0], self.at_rest).some(_MOST_COARSE)
         random = np.random.default_rng(self.settings.seed)
         reach = np.log(self.settings.spread)
         thetas = np.zeros((self.settings.starts, len(free)))
@@ -168,7 +165,7 @@ class ParameterSearch:
         """Fit of the numbers that are kept to all of the record, in windows of the length that leaves them least open."""
         fits: list[SearchFit] = []
         for samples in self.lengths:
-            windows, firsts = windows_of(self.segments, self.experiment, samples, self.at_rest)
+            windows = windows_of(self.segments, self.experiment, samples, self.at_rest)
             smoothness: dict[str, float] = {}
             if self.settings.method == "prediction_error":
                 for _ in range(_PASSES):
@@ -177,7 +174,7 @@ class ParameterSearch:
             end = fit(self.experiment, free, windows, theta)
             windows, end, errors, steps = refine_steps(self.experiment, free, windows, end)
             width = spread(end).with_error(*errors)
-            fits.append(SearchFit(free, end, width, windows, firsts, smoothness, steps, errors))
+            fits.append(SearchFit(free, end, width, windows, smoothness, steps, errors))
         fits = [candidate for candidate in fits if np.isfinite(candidate.openness)]
         if not fits:
             raise InputError(f"{self.name}: the model diverges on this log; its nominal numbers should be nearer")

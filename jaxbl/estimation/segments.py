@@ -21,9 +21,9 @@ from jaxbl.records import Record
 from jaxbl.records.least_squares import rms
 
 from .free_parameters import SignalSizes
-from .regression import Kinematics, Path, effect_states, kinematics_from
+from .regression import Kinematics, Path, effect_states
 from .smoother import Smoothed, smooth
-from .trajectory import Windows, cut
+from .trajectory import Windows
 
 _FEWEST = 50
 """Samples of a segment whose torques are compared: the smoother's ends, some ten samples each, are then a small part. Where
@@ -76,9 +76,12 @@ class Segment:
 
     @cached_property
     def kinematics(self) -> Kinematics:
-        """The smoothed motion as the equations of motion take it."""
-        states = {side: motion.state for side, motion in self.smoothed.items()}
-        return kinematics_from(self.time, self.torque, states, self.transmitted, self.before)
+        """The smoothed motion as the equations of motion take it; the input is held from each sample to the next."""
+        before = np.empty(0) if self.before is None else self.before
+        held = np.concatenate([before, self.torque])
+        earlier, mean = np.split(0.5 * (np.append(held[:1], held[:-1]) + held), [len(before)])
+        motion = [{side: smoothed.state[:, i].copy() for side, smoothed in self.smoothed.items()} for i in range(3)]
+        return Kinematics(self.time, mean, *motion, self.transmitted, before=earlier if len(earlier) else None)
 
 
 def skip_unknown_input(record: Record, at_rest: bool) -> Record:
@@ -170,23 +173,29 @@ def at_period(experiment: Experiment, period: float) -> Experiment:
     return eqx.tree_at(lambda e: e.run.sample_period, experiment, np.asarray(period, float))
 
 
-def windows_of(
-    segments: Sequence[Segment], experiment: Experiment, samples: int, at_rest: bool = False
-) -> tuple[Windows, np.ndarray]:
-    """A log in windows of so many samples, segment by segment, and the row that each begins with.
+def windows_of(segments: Sequence[Segment], experiment: Experiment, samples: int, at_rest: bool = False) -> Windows:
+    """A log in windows of so many samples, segment by segment.
 
     Shorter segments are left out; the experiment says how effects begin, `at_rest` whether each segment begins at rest.
     """
-    pieces, firsts = [], []
-    noise = reading_noise(segments)
+    columns = []
     for segment in segments:
         if len(segment) < samples:
             continue
-        k = segment.kinematics
+        k, index = segment.kinematics, np.arange(len(segment))
         along = Path(k.time, segment.torque, k.position, k.velocity, before=segment.before)
-        start = PlantState(k.position, k.velocity, _hold_frictions(experiment, segment, effect_states(experiment, along)))
-        pieces.append(
-            cut(segment.torque, segment.readings, segment.period, start, noise, samples, float(segment.time[0]), at_rest)
-        )
-        firsts.append(segment.rows.start + samples * np.arange(len(segment) // samples))
-    return Windows.join(pieces), np.concatenate(firsts)
+        effects = _hold_frictions(experiment, segment, effect_states(experiment, along))
+        standing = at_rest & (index == 0)
+        velocity = {side: np.where(standing, 0.0, speed) for side, speed in k.velocity.items()}
+        state, time = PlantState(k.position, velocity, effects), segment.time[0] + segment.period * index
+        columns.append((segment.torque, segment.readings, time, state, standing, segment.rows.start + index))
+
+    def cut(*pieces: Any) -> np.ndarray:
+        """Cut a column that comes in a piece a segment; shape (windows, samples)."""
+        wholes = (np.asarray(piece)[: len(piece) // samples * samples] for piece in pieces)
+        return np.concatenate([whole.reshape(-1, samples) for whole in wholes])
+
+    torque, measured, *others = jax.tree.map(cut, *columns)
+    time, start, standing, rows = jax.tree.map(lambda column: column[:, 0], others)
+    finer = np.zeros((*torque.shape, len(measured)))
+    return Windows(torque, measured, time, start, reading_noise(segments), standing, finer, rows)

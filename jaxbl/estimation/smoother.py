@@ -45,10 +45,6 @@ class Smoothed(NamedTuple):
     jerk: float | np.floating
 
     @property
-    def position(self) -> np.ndarray:
-        return self.state[:, 0]
-
-    @property
     def velocity(self) -> np.ndarray:
         return self.state[:, 1]
 

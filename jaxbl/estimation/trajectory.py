@@ -52,6 +52,7 @@ class Windows(eqx.Module):
         at_rest: whether a window begins at rest: velocities as guessed, not fitted; shape (windows,).
         finer: what finer plant steps than the experiment's add to the simulated positions, over the noise
             (:mod:`.plant_steps`), shape (windows, samples, sides).
+        rows: of the log that the windows begin with, shape (windows,).
         gain: of the predictor (:func:`jaxbl.chain.plant_trajectory`) of each side, shape (2,);
             None: free runs, output error.
     """
@@ -63,28 +64,19 @@ class Windows(eqx.Module):
     noise: dict[str, float]
     at_rest: np.ndarray
     finer: np.ndarray
+    rows: np.ndarray
     gain: dict[str, np.ndarray] | None = None
 
     def only(self, places: np.ndarray | slice) -> "Windows":
         """Some of the windows."""
         # by NumPy: without a compiled program for each length
-        columns, common = eqx.partition(self, _IN_COLUMNS)
-        return eqx.combine(jax.tree.map(lambda column: np.asarray(column)[places], columns), common)
+        columns = jax.tree.map(lambda leaf: np.asarray(leaf)[places] if np.ndim(leaf) else leaf, replace(self, gain=None))
+        return replace(columns, gain=self.gain)
 
     def some(self, most: int) -> "Windows":
         """At most so many of the windows, spread over the record."""
         count = len(self.time)
         return self.only(np.linspace(0, count - 1, min(count, most)).astype(int))
-
-    @staticmethod
-    def join(parts: Sequence["Windows"]) -> "Windows":
-        """Windows of several parts of a record, with the noise and gain of the first."""
-        columns, common = zip(*(eqx.partition(part, _IN_COLUMNS) for part in parts), strict=True)
-        return eqx.combine(jax.tree.map(lambda *pieces: np.concatenate(pieces), *columns), common[0])
-
-
-_IN_COLUMNS = Windows(True, True, True, True, False, True, True, False)  # type: ignore[arg-type]
-"""What has a row a window."""
 
 
 class Fit(NamedTuple):
@@ -356,37 +348,3 @@ def fit(
         if not np.any(gains > _GAINED * np.sum(best.squares) / count):
             break
     return Fit(best.theta, best.eliminated.start, best.eliminated.residual, slope(best), converged)
-
-
-def cut(
-    torque: np.ndarray,
-    measured: dict[str, np.ndarray],
-    period: float,
-    start: Any,
-    noise: dict[str, float],
-    samples: int,
-    first: float = 0.0,
-    at_rest: bool = False,
-) -> Windows:
-    """Cut part of a record into as many windows of so many samples as fit into it, shapes and units as of :class:`Windows`.
-
-    `start` are the states at all samples, :class:`jaxbl.chain.PlantState` with leaves of shape (samples,); `first` is the
-    time of the first sample, s; `at_rest` says whether the part begins at rest.
-    """
-    count = len(torque) // samples
-
-    def split(values: Any) -> Any:
-        return np.asarray(values)[: count * samples].reshape(count, samples)
-
-    standing = np.arange(count) == (0 if at_rest else -1)
-    start = jax.tree.map(lambda x: split(x)[:, 0], start)
-    still = jax.tree.map(lambda x: np.where(standing, 0.0, x), start.velocity)
-    return Windows(
-        torque=split(torque),
-        measured=jax.tree.map(split, measured),
-        time=first + period * samples * np.arange(count),
-        start=PlantState(start.position, still, start.effects),
-        noise=noise,
-        at_rest=standing,
-        finer=np.zeros((count, samples, len(measured))),
-    )

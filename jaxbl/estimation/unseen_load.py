@@ -74,8 +74,6 @@ _STATES = 4
 """Numbers that a part of a log begins with: positions and velocities of both sides."""
 _IN_CONTACT = np.array([0.0, 0.0, 1.0, 0.0])
 """Size of these by the prior: at a flank of the gap, the load as fast as the motor."""
-_ignore_divergence = partial(np.errstate, invalid="ignore", over="ignore")
-"""A model that diverges is given up by its errors."""
 GAPS = "half_gap", "dead_zone"
 """Ends of the paths of numbers that make a gap."""
 
@@ -100,10 +98,10 @@ class Point(NamedTuple):
     deviance: float = np.inf
 
     @property
+    @np.errstate(all="ignore")
     def variance(self) -> float:
-        """Mean square of the prediction errors, rad^2."""
-        with _ignore_divergence():
-            return float(np.nan_to_num(np.mean(self.errors**2), nan=np.inf))
+        """Mean square of the prediction errors, rad^2; infinite where the model diverges."""
+        return float(np.nan_to_num(np.mean(self.errors**2), nan=np.inf))
 
     @property
     def away(self) -> np.ndarray:
@@ -165,13 +163,11 @@ class UnseenLoad:
 
         From a friction that is too large no way leads back: the load sticks, and nothing depends on it.
         """
-        rows = []
-        for k in (segment.kinematics for segment in self.segments):
-            speed = k.velocity["motor"]
-            rows.append(np.stack([k.acceleration["motor"], speed, np.sign(speed), np.ones(len(speed)), k.torque], axis=1))
-        moving = np.concatenate(rows)
-        moving = moving[np.abs(moving[:, 1]) > 0.1 * self._speed]
-        coefficients = np.linalg.lstsq(moving[:, :-1], moving[:, -1], rcond=None)[0]
+        motions = [segment.kinematics for segment in self.segments]
+        rows = np.concatenate([[k.torque, k.acceleration["motor"], k.velocity["motor"]] for k in motions], axis=1)
+        torque, acceleration, speed = rows[:, np.abs(rows[2]) > 0.1 * self._speed]
+        columns = np.stack([acceleration, speed, np.sign(speed), np.ones_like(speed)], axis=1)
+        coefficients = np.linalg.lstsq(columns, torque, rcond=None)[0]
         least = np.array([1e-2 * self.torque / self._speed, 1e-2 * self.torque])
         total, thetas = np.maximum(coefficients[1:3], least), np.zeros((len(_SHARES), len(self.free)))
         viscous = {"drive.motor_viscous": "motor", "drive.load_viscous": "load"}
@@ -245,14 +241,14 @@ class UnseenLoad:
             states_of.append(jax.tree.map(lambda x: x[0], states))
         return states_of
 
+    # a model that diverges is given up by its errors
+    @np.errstate(all="ignore")
     def evaluate(self, point: Point) -> Point:
         """A point with its prediction errors by this model."""
         pieces = zip(self.segments, self.states(point), self.skipped, strict=True)
-        # a model that diverges
-        with _ignore_divergence():
-            errors = [(segment.readings["motor"] - state.position["motor"])[skip:] for segment, state, skip in pieces]
-            point = point._replace(errors=np.concatenate(errors))
-            deviance = float(self.count * np.log(point.variance) + np.sum(self.precision * point.away**2))
+        errors = [(segment.readings["motor"] - state.position["motor"])[skip:] for segment, state, skip in pieces]
+        point = point._replace(errors=np.concatenate(errors))
+        deviance = float(self.count * np.log(point.variance) + np.sum(self.precision * point.away**2))
         return point._replace(deviance=deviance if np.isfinite(deviance) else np.inf)
 
     def twists(self, point: Point) -> list[Any]:
@@ -410,7 +406,6 @@ class Gap(NamedTuple):
         gain: of minus twice the log-likelihood by the gap, correlation of the errors counted.
         crossings: of the gap from flank to flank; of changes of sign of the transmitted torque without a gap.
         at_most: the largest half gap that the log does not rule out, where it does not show one (95 %), rad.
-        travel: of the motor, rad.
         unmet: whether a load that is never met, in a gap wider than the motor's travel, meets the readings as well as none.
     """
 
@@ -420,7 +415,6 @@ class Gap(NamedTuple):
     gain: float
     crossings: int
     at_most: float
-    travel: float
     unmet: bool = False
 
     @property
@@ -486,7 +480,7 @@ def find_gap(model: UnseenLoad) -> Gap:
     # what neighbouring fits find differently makes numbers uncertain, and rules out less; it is no correlation of errors
     correlated, worth = (max(float(width.inflation[place]) ** 2, 1.0) for width in (model.spread(best), spread))
     gain = max(without.deviance - best.deviance, 0.0) / correlated
-    gap = Gap(best, without, spread, gain, 0, travel, travel)
+    gap = Gap(best, without, spread, gain, 0, travel)
     if gap.is_needed:
         return gap._replace(crossings=model.count_turns(best, model.half_gap(best.theta)))
     if _is_unmet(held, without, starts[-1], worth):

@@ -1,6 +1,8 @@
 """The observers over rows as they come: `jaxbl.chain.step` with recorded input and positions, in blocks of one size."""
 
 import dataclasses
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import jax
@@ -61,13 +63,12 @@ class LiveChain:
         for start in range(0, len(torque), BLOCKS[-1]):
             count = min(len(torque) - start, BLOCKS[-1])
             size = next(block for block in BLOCKS if count <= block)
-            parts = (values[start : start + count] for values in (torque, *measured.values()))
-            torque_block, *positions = (jnp.asarray(np.pad(part, (0, size - count))) for part in parts)
-            measured_block = dict(zip(measured, positions, strict=True))
-            self._state, rows = _run_block(self._experiment, self._state, torque_block, measured_block, jnp.asarray(count))
+            part = jax.tree.map(itemgetter(slice(start, start + count)), (torque, measured))
+            padded = jax.tree.map(partial(np.pad, pad_width=(0, size - count)), part)
+            self._state, rows = _run_block(self._experiment, self._state, *padded, jnp.asarray(count))
             blocks.append({name: np.asarray(values)[:count] for name, values in rows.items()})
         motion = {f"{side}.position": values for side, values in measured.items()}
-        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]} | motion
+        return jax.tree.map(lambda *values: np.concatenate(values), *blocks) | motion
 
     def compile(self) -> None:
         """Compile what rows will need, before any come."""

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from jaxbl.estimation.logs import on_record, read_logs
 from jaxbl.files import to_jsonable
 from jaxbl.json_types import JsonObject
 from jaxbl.quantity import Quantity
-from jaxbl.records import POSITION_CHANNELS, LogTable, Record
-from jaxbl.records.least_squares import student_interval
+from jaxbl.records import POSITION_CHANNELS, Record
 from jaxbl.records.live import (
     Datagrams,
     FollowedFile,
@@ -57,6 +57,10 @@ BLIND_WINDOWS = 10.0
 """Windows without a number after which a watch is blind, where nothing else is stated."""
 _QUIET = 10.0
 """Seconds between remarks on a stream from which nothing comes, or from which rows are left out."""
+_LAW_UNITS = {"half_gap": "rad", "stiffness": "N m/rad"}
+"""Numbers of the law, which are taken from the side that determines them best, and their units on the motor's side."""
+_FRICTION_UNITS = {"coulomb": "N m", "viscous": "N m s/rad"}
+"""Numbers of each side itself, and their units."""
 
 Values = JsonObject
 """What is known at a time; keys are the columns of `watch.csv`."""
@@ -75,7 +79,6 @@ class WatchTask:
         window: seconds that each value is from.
         interval: seconds between values.
         blind: seconds without a number after which the watch says that it does not see.
-        units: of the numbers, by side and name.
     """
 
     config: Config
@@ -86,7 +89,37 @@ class WatchTask:
     window: float
     interval: float
     blind: float
-    units: dict[str, dict[str, str]]
+
+    @property
+    def period(self) -> float:
+        """Of the rows, s."""
+        return float(self.experiment.run.sample_period)
+
+    @cached_property
+    def law_numbers(self) -> list[str]:
+        """Names of the numbers of the law."""
+        assert self.experiment.transmission is not None
+        return [name for name in _LAW_UNITS if name in self.experiment.transmission.truth()]
+
+    @cached_property
+    def columns(self) -> list[str]:
+        """The columns of `watch.csv`."""
+        law = self.law_numbers
+        columns = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
+        columns += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction", "blind"]
+        by_side = itertools.product(self.experiment.sides, [*law, *_FRICTION_UNITS], ("", "_error"))
+        return [*columns, *(f"{side}.{name}{end}" for side, name, end in by_side)]
+
+    @cached_property
+    def units(self) -> dict[str, dict[str, str]]:
+        """Units of the numbers, by side and name."""
+
+        def find_units(side: str, units: dict[str, str]) -> dict[str, str]:
+            is_linear = self.config.log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m"
+            return {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
+
+        law = find_units("motor", _LAW_UNITS)
+        return {side: law | find_units(side, _FRICTION_UNITS) for side in POSITION_CHANNELS}
 
 
 @dataclass(frozen=True)
@@ -197,16 +230,7 @@ def read_watch_task(
     if record is not None and (longest := record.time[-1] - record.time[0]) < window:
         raise InputError(f"{source}: has {longest:.4g} s, window is {window:g} s; it should be shorter than the log")
     blind = BLIND_WINDOWS * window if blind is None else blind
-    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, blind, _find_units(config.log))
-
-
-def _find_units(log: LogTable) -> dict[str, dict[str, str]]:
-    def find_units(side: str, units: dict[str, str]) -> dict[str, str]:
-        is_linear = log.position_source(POSITION_CHANNELS[side])[1].si_unit == "m"
-        return {name: on_a_line(unit) if is_linear else unit for name, unit in units.items()}
-
-    law = find_units("motor", {"half_gap": "rad", "stiffness": "N m/rad"})
-    return {side: law | find_units(side, {"coulomb": "N m", "viscous": "N m s/rad"}) for side in POSITION_CHANNELS}
+    return WatchTask(config, address, record, experiment, alarm_gap, window, interval, blind)
 
 
 def run_watch(
@@ -225,7 +249,6 @@ def run_watch(
     with jax.enable_x64(True), limit_blas_threads():
         watcher = Watcher(task, on_values or (lambda values: None))
         counts: Mapping[str, int] = {}
-        notes: list[str] = []
         if (record := task.record) is None:
             counts = _watch_stream(watcher, task, ended or (lambda: False), on_remark or (lambda text: None))
         else:
@@ -233,9 +256,8 @@ def run_watch(
             for part in record.segments:
                 positions = {side: values[part] for side, values in record.positions.items()}
                 watcher.take(Rows(float(record.time[part.start]), record.torque[part], positions, True))
-            notes += [*record.warnings, *record.notes]
-    values = pd.DataFrame(watcher.values, columns=watcher.columns)
-    return Watch(task, to_jsonable(_summarise(task, watcher, values, counts, notes)), values)
+    values = pd.DataFrame(watcher.values, columns=task.columns)
+    return Watch(task, to_jsonable(_summarise(task, watcher, values, counts)), values)
 
 
 def _watch_stream(
@@ -243,9 +265,9 @@ def _watch_stream(
 ) -> Mapping[str, int]:
     """Take in rows as they come. Returns what was left out: its kind -> its number."""
     watcher.chain.compile()
-    columns, period = stream_columns(task.config.log), float(task.experiment.run.sample_period)
+    columns = stream_columns(task.config.log)
     source = Datagrams(task.name, columns) if "://" in task.name else FollowedFile(Path(task.name), columns)
-    stream = Stream(source, task.config.log, period)
+    stream = Stream(source, task.config.log, task.period)
     last_rows = last_remark = time.monotonic()
     counts_before: dict[str, int] = {}
     with closing(source):
@@ -273,22 +295,6 @@ def describe_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{number} {kind}" for kind, number in counts.items())
 
 
-def _number_names(experiment: Experiment) -> tuple[list[str], list[str]]:
-    """Return the numbers of each side, and those of the law, which are taken from the side that determines them best."""
-    assert experiment.transmission is not None
-    law = [name for name in ("half_gap", "stiffness") if name in experiment.transmission.truth()]
-    return [*law, "coulomb", "viscous"], law
-
-
-def watch_columns(task: WatchTask) -> list[str]:
-    """Return the columns of `watch.csv`."""
-    names, law = _number_names(task.experiment)
-    columns = ["t", "side", *(f"{name}{end}" for name in law for end in ("", "_from", "_to"))]
-    columns += [*(["half_gap_least"] if "half_gap" in law else []), "alarm", "contradiction", "blind"]
-    by_side = itertools.product(task.experiment.sides, names, ("", "_error"))
-    return [*columns, *(f"{side}.{name}{end}" for side, name, end in by_side)]
-
-
 class Watcher:
     """Takes rows, and makes values every so many seconds.
 
@@ -298,7 +304,6 @@ class Watcher:
 
     Attributes:
         values: all rows of values.
-        columns: their names.
         samples: how many were taken in.
         start: time of the first one, s by the stamps; None before it.
         longest_blindness: s without a number, by the rows that came, or by the clock if none did; 0 up to what was stated.
@@ -306,11 +311,7 @@ class Watcher:
 
     def __init__(self, task: WatchTask, on_values: Callable[[Values], None]):
         self._task, self._on_values = task, on_values
-        experiment = task.experiment
-        self._period = float(experiment.run.sample_period)
-        self.chain, self._window = LiveChain(experiment), Window(experiment, task.window)
-        self._names, self._chosen = _number_names(experiment)
-        self.columns = watch_columns(task)
+        self.chain, self._window = LiveChain(task.experiment), Window(task.experiment, task.window)
         self.values: list[Values] = []
         self.samples = 0
         self.start: float | None = None
@@ -330,42 +331,42 @@ class Watcher:
         done = 0
         while done < count:
             # the row at which values are due, those of a gap in time once; half a period of slack: times are rounded
-            rows_until_due = math.ceil((self._due - first) / self._period - 0.5) + 1
+            rows_until_due = math.ceil((self._due - first) / self._task.period - 0.5) + 1
             end = min(max(rows_until_due, done + 1), count)
             part = slice(done, end)
             estimates = self.chain.take(rows.torque[part], {side: x[part] for side, x in rows.positions.items()}, restarts)
             self._window.add(estimates, restarts)
             self.samples += end - done
             done, restarts = end, False
-            now = self._last_time = first + (end - 1) * self._period
-            if now >= self._due - 0.5 * self._period:
+            now = self._last_time = first + (end - 1) * self._task.period
+            if now >= self._due - 0.5 * self._task.period:
                 self._due = self._following_due(now)
                 if (windows := self._window.estimate()) is not None:
                     self._add_values(now, windows)
 
     def _following_due(self, now: float) -> float:
         interval = self._task.interval
-        return interval * (math.floor((now + 0.5 * self._period) / interval) + 1)
+        return interval * (math.floor((now + 0.5 * self._task.period) / interval) + 1)
 
     def check_sight(self) -> None:
         """Add a row without numbers where none has been found for longer than stated, as often as that has passed again."""
         now = time.monotonic()
-        blind = max(now - self._clock_seen, (self.samples - self._samples_seen) * self._period)
+        blind = max(now - self._clock_seen, (self.samples - self._samples_seen) * self._task.period)
         if blind > self._task.blind and now - self._clock_said > self._task.blind:
             self._clock_said = now
             self._add_values(self._last_time, {}, blind)
 
     def _add_values(self, now: float, windows: dict[str, SideNumbers], blind: float = 0.0) -> None:
-        values: Values = dict.fromkeys(self.columns, math.nan) | {"t": now, "side": ""}
+        values: Values = dict.fromkeys(self._task.columns, math.nan) | {"t": now, "side": ""}
         values |= {"alarm": False, "contradiction": False, "blind": False}
         for side, window in windows.items():
-            for name in self._names:
+            for name in [*self._task.law_numbers, *_FRICTION_UNITS]:
                 number = window.numbers[name]
                 values |= {f"{side}.{name}": number.value, f"{side}.{name}_error": number.standard_error}
         values |= self._judge_gap(windows)
         if values["side"]:
             self._samples_seen, self._clock_seen = self.samples, time.monotonic()
-        blind = max(blind, (self.samples - self._samples_seen) * self._period)
+        blind = max(blind, (self.samples - self._samples_seen) * self._task.period)
         if blind > self._task.blind:
             self.longest_blindness, values["blind"] = max(self.longest_blindness, blind), True
         self.values.append(values)
@@ -373,7 +374,7 @@ class Watcher:
 
     def _judge_gap(self, windows: dict[str, SideNumbers]) -> Values:
         """Choose the side that determines gap or stiffness best, and decide on the alarm."""
-        task, name = self._task, self._chosen[0]
+        task, name = self._task, self._task.law_numbers[0]
         law = task.experiment.transmission
         assert law is not None
         nominal = float(getattr(law, name))
@@ -386,14 +387,14 @@ class Watcher:
             return {}
         side = min(numbers_by_side, key=lambda side: numbers_by_side[side][name].standard_error)
         values: Values = {"side": side}
-        for key in self._chosen:
+        for key in task.law_numbers:
             number = numbers_by_side[side][key]
-            low, high = student_interval(number.value, number.standard_error, BLOCKS - 1)
-            values |= {key: number.value, f"{key}_from": low, f"{key}_to": high}
+            reach = INTERVAL * number.standard_error
+            values |= {key: number.value, f"{key}_from": number.value - reach, f"{key}_to": number.value + reach}
         differing = [
             key
             for first, second in itertools.combinations(numbers_by_side.values(), 2)
-            for key in self._chosen
+            for key in task.law_numbers
             if _surely_differ(first[key], second[key])
         ]
         values["contradiction"] = bool(differing)
@@ -410,10 +411,8 @@ def _surely_differ(first: Quantity, second: Quantity) -> bool:
     return abs(first.value - second.value) > _BOUND * math.hypot(first.standard_error, second.standard_error)
 
 
-def _summarise(
-    task: WatchTask, watcher: Watcher, values: pd.DataFrame, counts: Mapping[str, int], notes: list[str]
-) -> JsonObject:
-    determined = values[values["side"] != ""]
+def _summarise(task: WatchTask, watcher: Watcher, values: pd.DataFrame, counts: Mapping[str, int]) -> JsonObject:
+    record, determined = task.record, values[values["side"] != ""]
     alarms = determined[determined["alarm"].astype(bool)]
 
     def list_numbers(rows: Any, i: int) -> Values | None:
@@ -423,8 +422,8 @@ def _summarise(
         "title": task.config.title,
         "file": str(Path(task.name).resolve()) if "://" not in task.name else task.name,
         "samples": watcher.samples,
-        "sample_period": float(task.experiment.run.sample_period),
-        "start": (0.0 if watcher.start is None else watcher.start) + (0.0 if task.record is None else task.record.start),
+        "sample_period": task.period,
+        "start": (watcher.start or 0.0) + (0.0 if record is None else record.start),
         "window": task.window,
         "every": task.interval,
         "alarm_gap": task.alarm_gap,
@@ -438,7 +437,7 @@ def _summarise(
         "last": list_numbers(determined, -1),
         "units": task.units,
         "left_out": dict(counts),
-        "notes": notes,
+        "notes": [] if record is None else [*record.warnings, *record.notes],
     }
 
 

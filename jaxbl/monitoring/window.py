@@ -120,7 +120,8 @@ class Window:
         self._half = max(math.ceil(_SLOPE * constant / self._period), 2)
         self._rows: NamedArrays = {}
         self._rows_until_settled = 0
-        self._last_estimates: dict[str, SideNumbers] = {}
+        self._matched = experiment.identifier.regressor_filter == "matched"
+        self._last_estimates = dict.fromkeys(experiment.sides, SideNumbers({}, experiment.transmission, 0.0))
 
     def add(self, rows: NamedArrays, restarts: bool) -> None:
         """Add rows from :meth:`.live_chain.LiveChain.take`.
@@ -159,15 +160,11 @@ class Window:
         return estimates
 
     def _estimate_side(self, side: str, rows: NamedArrays) -> SideNumbers | None:
-        experiment = self._experiment
-        matched = experiment.identifier is not None and experiment.identifier.regressor_filter == "matched"
-        last = self._last_estimates.get(side)
-        law, zero = (experiment.transmission, 0.0) if last is None else (last.law, last.zero)
-        assert law is not None
+        experiment, (_, law, zero) = self._experiment, self._last_estimates[side]
         columns = {name: jnp.asarray(values) for name, values in rows.items()}
         period, gain = (jnp.asarray(number, float) for number in (self._period, experiment.drive.torque_gain(side)))
         for _ in range(_ITERATIONS):
-            sums = _sum_blocks(law, experiment.equivalent_control, period, matched, gain, jnp.asarray(zero), columns)
+            sums = _sum_blocks(law, experiment.equivalent_control, period, self._matched, gain, jnp.asarray(zero), columns)
             numbers = self._solve_with_errors(side, law, *map(np.asarray, sums))
             if numbers is None:
                 return None

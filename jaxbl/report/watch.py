@@ -9,7 +9,7 @@ import tomli_w
 from jaxbl.files import catch_write_errors
 from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
-from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts, watch_columns
+from jaxbl.monitoring.watch import INTERVAL, Watch, WatchTask, describe_counts
 from jaxbl.records.signal_quality import find_runs
 from jaxbl.result import KeyFigure, Result
 
@@ -84,7 +84,7 @@ def open_values(folder: Path, task: WatchTask) -> Callable[[JsonObject], None]:
 
     def add(values: JsonObject) -> None:
         nonlocal mode
-        row = pd.DataFrame([values], columns=watch_columns(task))
+        row = pd.DataFrame([values], columns=task.columns)
         with catch_write_errors(folder):
             row.to_csv(folder / VALUES, mode=mode, header=mode == "w", index=False)
         mode = "a"

@@ -34,7 +34,7 @@ def log(tmp_path_factory):
 @pytest.mark.parametrize("from_rest", [False, True])
 def test_runs_are_those_of_the_fit(log, from_rest):
     (model, _), record = log
-    windows, _ = windows_of(segments_of(record, model.sides), model, 250, from_rest)
+    windows = windows_of(segments_of(record, model.sides), model, 250, from_rest)
     actual, seen = best_runs(model, windows, 8, from_rest, np.arange(8)), count_seen(250)
     first = dataclasses.replace(
         windows,
@@ -55,7 +55,7 @@ def test_noise_of_the_state_that_is_fitted_is_foretold(tmp_path):
     study = multisine_study(1.0, transmission={"law": "linear_shaft", "stiffness": 60.0})
     model, _ = with_torques(as_arrays(prepare(read_config(study)), float))
     segments = segments_of(record_study(study, tmp_path), model.sides)
-    windows, _ = windows_of(segments, model, 250)
+    windows = windows_of(segments, model, 250)
     random, runs, every_window = np.random.default_rng(2), [], np.arange(len(windows.time))
     for _ in range(20):
         measured = {
@@ -74,7 +74,7 @@ def test_a_state_that_follows_from_the_motion_is_free_only_where_a_log_begins(lo
     (model, _), record = log
     swinging = make_effect("load.flexibility", inertia=0.5, frequency=3.0)
     model = with_effects(model, (*model.effects, as_arrays(swinging, float)))
-    windows, _ = windows_of(segments_of(record, model.sides, from_rest), model, 250, from_rest)
+    windows = windows_of(segments_of(record, model.sides, from_rest), model, 250, from_rest)
     runs = best_runs(model, windows, 4, from_rest, np.arange(len(windows.time)))
     for have, start in zip(runs.states.effects[-1], windows.start.effects[-1], strict=True):
         moved = np.asarray(have)[:, 0] != np.asarray(start)

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from small_study import rigid_study
+from trace_segment import cut
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.parameters import set_leaves
 from jaxbl.drive.plant import PlantState
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import interval, profile, spread
-from jaxbl.estimation.trajectory import cut, fit
+from jaxbl.estimation.trajectory import fit
 
 PERIOD, SAMPLES, NOISE = 2e-3, 400, 1e-3
 

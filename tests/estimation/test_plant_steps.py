@@ -4,13 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_study import rigid_study
+from trace_segment import cut
 
 from jaxbl.chain import PlantState, plant_trajectory
 from jaxbl.config import prepare, read_config
 from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import spread
 from jaxbl.estimation.plant_steps import refine_steps
-from jaxbl.estimation.trajectory import cut, fit
+from jaxbl.estimation.trajectory import fit
 
 PERIOD, SAMPLES = 2e-2, 400
 PATHS = ["drive.motor_inertia", "drive.motor_viscous", "effects.load.gravity.torque"]

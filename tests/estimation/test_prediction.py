@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 from small_study import rigid_study
+from trace_segment import cut
 
 from jaxbl.config import prepare, read_config
 from jaxbl.drive.plant import PlantState
@@ -12,7 +13,7 @@ from jaxbl.estimation.free_parameters import make_free_parameters
 from jaxbl.estimation.intervals import spread
 from jaxbl.estimation.prediction import kalman_gain, predictor
 from jaxbl.estimation.smoother import smooth
-from jaxbl.estimation.trajectory import cut, fit
+from jaxbl.estimation.trajectory import fit
 
 PERIOD, SAMPLES = 2e-3, 3000
 
@@ -57,7 +58,7 @@ def fit_numbers(experiment, free, windows):
 
 def cut_windows(torque, readings, samples):
     smoothed = smooth(jnp.asarray(readings["motor"]), PERIOD)
-    start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ())
+    start = PlantState({"motor": smoothed.state[:, 0]}, {"motor": smoothed.velocity}, ())
     return cut(torque, readings, PERIOD, start, {"motor": 1e-4}, samples)
 
 

@@ -12,16 +12,15 @@ from small_study import rigid_study, small_study
 
 from jaxbl.config import prepare, read_config
 from jaxbl.estimation.free_parameters import make_free_parameters, set_free_parameters
+from jaxbl.estimation.identification_summary import torque_errors
 from jaxbl.estimation.intervals import interval, spread
 from jaxbl.estimation.regression import (
     Kinematics,
     balance,
     decimate,
-    errors,
-    kinematics_from,
     model_torques,
 )
-from jaxbl.estimation.smoother import smooth
+from jaxbl.estimation.segments import segments_of
 from jaxbl.records import read_record
 
 T = jnp.linspace(0.0, 2.0, 4001)
@@ -73,11 +72,13 @@ def test_balance_is_the_equations_of_motion():
     torques = model_torques(
         experiment, Kinematics(T, u, position, velocity, acceleration), {s: jnp.full_like(T, 1e-9) for s in velocity}
     )
-    np.testing.assert_allclose(torques["transmission"], c, atol=1e-9)
+    np.testing.assert_allclose(torques["torque"], c, atol=1e-9)
     moving = jnp.abs(velocity["motor"]) > 1e-6
-    np.testing.assert_allclose((torques["motor"] - 0.3 * jnp.sign(velocity["motor"]) + 0.1 * u)[moving], 0.0, atol=1e-9)
     np.testing.assert_allclose(
-        torques["load"], 2.0 * jnp.sin(position["load"] - 0.1) + 0.7 * acceleration["load"], atol=1e-9
+        (torques["motor.effects"] - 0.3 * jnp.sign(velocity["motor"]) + 0.1 * u)[moving], 0.0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        torques["load.effects"], 2.0 * jnp.sin(position["load"] - 0.1) + 0.7 * acceleration["load"], atol=1e-9
     )
 
 
@@ -152,9 +153,8 @@ def test_emps_by_the_published_method_and_measure():
     values = [float(number.value(result.theta[i])) for i, number in enumerate(free)]
     np.testing.assert_allclose(values, [95.1, 205.7, 20.2, -3.17], rtol=0.03)
     fitted = set_free_parameters(experiment, free, result.theta)
-    assert errors(fitted, parts[:1], 10)["motor"]["relative"] < 0.042
-    assert errors(fitted, parts[1:], 10)["motor"]["relative"] < 0.054
+    assert torque_errors(records[0], fitted, parts[:1], 10)["motor"]["relative"] < 0.042
+    assert torque_errors(records[1], fitted, parts[1:], 10)["motor"]["relative"] < 0.054
     # the smoother in place of the filter says the same
-    states = {"motor": smooth(records[0].positions["motor"], 1e-3).state}
-    smoothed = kinematics_from(records[0].time, records[0].torque, states)
-    assert errors(fitted, [smoothed], 10)["motor"]["relative"] < 0.042
+    (segment, *_) = segments_of(records[0], ["motor"])
+    assert torque_errors(records[0], fitted, [segment.kinematics], 10)["motor"]["relative"] < 0.042

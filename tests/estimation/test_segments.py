@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hidden.cases import Log
@@ -35,13 +34,13 @@ def lagged_log(tmp_path_factory):
 
 def test_windows_begin_with_the_torque_that_the_actuator_makes_then(lagged_log):
     record, experiment, segments = lagged_log
-    windows, firsts = windows_of(segments, experiment, 250)
+    windows = windows_of(segments, experiment, 250)
     keep = np.exp(-2e-3 / LAG["time_constant"])
     actuator_torque = lfilter([0.0, 1.0 - keep], [1.0, -keep], record.torque, zi=[record.torque[0] * keep])[0]
     actuator_torque[0] = record.torque[0]
     ((result,),) = windows.start.effects
-    np.testing.assert_allclose(result, actuator_torque[firsts], atol=1e-3 * np.max(np.abs(actuator_torque)))
-    np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].position[jnp.asarray(firsts)])
+    np.testing.assert_allclose(result, actuator_torque[windows.rows], atol=1e-3 * np.max(np.abs(actuator_torque)))
+    np.testing.assert_allclose(windows.start.position["motor"], segments[0].smoothed["motor"].state[windows.rows, 0])
 
 
 def test_a_segment_gives_up_its_beginning_for_the_inputs_before_it(lagged_log):

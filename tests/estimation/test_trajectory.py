@@ -11,6 +11,7 @@ from hidden.simulator import Machine, Run, simulate
 from hidden_log import GAP, GEARED
 from scipy.optimize import least_squares
 from small_study import rigid_study, small_study
+from trace_segment import cut
 
 from jaxbl.chain import plant_trajectory
 from jaxbl.config import prepare, read_config
@@ -19,7 +20,7 @@ from jaxbl.errors import InputError
 from jaxbl.estimation.free_parameters import SignalSizes, make_free_parameters, set_free_parameters
 from jaxbl.estimation.intervals import refusals, spread
 from jaxbl.estimation.smoother import smooth
-from jaxbl.estimation.trajectory import Fit, cut, fit
+from jaxbl.estimation.trajectory import Fit, fit
 from jaxbl.fused.compilation import jit
 
 TRUE = {
@@ -54,7 +55,7 @@ def simulate_motion(kind, samples, period=PERIOD):
 
 def cut_windows(torque, readings, noise, samples, period=PERIOD):
     motions = {side: smooth(values, period) for side, values in readings.items()}
-    start = PlantState({s: x.position for s, x in motions.items()}, {s: x.velocity for s, x in motions.items()}, ())
+    start = PlantState({s: x.state[:, 0] for s, x in motions.items()}, {s: x.velocity for s, x in motions.items()}, ())
     return cut(torque, readings, period, start, noise, samples)
 
 
@@ -156,7 +157,7 @@ def test_scales_that_one_record_cannot_part_are_refused():
     paths.append("effects.actuator.gain_error.relative")
     free = make_free_parameters(experiment, paths, 0.1)
     smoothed = smooth(readings["motor"], PERIOD)
-    start = PlantState({"motor": smoothed.position}, {"motor": smoothed.velocity}, ((), ()))
+    start = PlantState({"motor": smoothed.state[:, 0]}, {"motor": smoothed.velocity}, ((), ()))
     windows = cut(torque, readings, PERIOD, start, {"motor": 1e-5}, 250)
     result = fit(experiment, free, windows, np.zeros(len(free)))
     refused, condition = refusals(free, spread(result))

@@ -24,7 +24,7 @@ import jaxbl
 from jaxbl.cli import app, main
 from jaxbl.errors import InputError
 from jaxbl.files import read_result
-from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch, watch_columns
+from jaxbl.monitoring.watch import Watcher, read_watch_task, run_watch
 from jaxbl.quantity import Quantity
 
 LIMIT = 1.25 * HALF_GAP
@@ -77,7 +77,7 @@ def run_command(*words):
 def test_a_gap_that_grows_is_followed_and_raises_an_alarm(growing_watch):
     result, told_values = growing_watch
     values = result.values
-    assert list(values.columns) == watch_columns(result.task)
+    assert list(values.columns) == result.task.columns
     assert [row["t"] for row in told_values] == values["t"].tolist() == pytest.approx(np.arange(4.0, SECONDS, 0.5))
     before, after = values[values["t"] <= 5.0], values[values["t"] >= 13.5]
     for part, size in ((before, HALF_GAP), (after, 2.0 * HALF_GAP)):

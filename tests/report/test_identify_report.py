@@ -71,7 +71,7 @@ def make_identification(data, folder, *, gap=False, unit="rad", transmitted=Fals
         trace[f"{side}.acceleration"] = np.gradient(trace[f"{side}.velocity"], record.sample_period)
         trace[f"{side}.residual"] = 1e-4 * np.random.default_rng(0).standard_normal(len(trace))
     for name, values in regression_torques(config, trace, sides).items():
-        trace["torque" if name == "transmission" else f"{name}.effects"] = np.asarray(values)
+        trace[name] = np.asarray(values)
     if transmitted:
         trace["transmitted"] = truth["torque"]
     names = [name for name in ("stiffness", "dead_zone", "half_gap") if f"motor.{name}" in trace]
