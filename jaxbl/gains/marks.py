@@ -17,7 +17,6 @@ from jaxbl.sweeps.elementwise import call_in_float64
 from jaxbl.sweeps.trial import run
 
 from .below_bound import read_disturbance
-from .pilot import list_axes
 from .stages import Stages
 from .under_tuned import Disturbance, SineError, excursion, peak_law, simulate_error
 from .worst_case import half_cycle
@@ -39,8 +38,7 @@ def judge_marks(ideal: Config, stages: Stages) -> list[JsonObject]:
             continue
         pairs = [(mark.lambda_, mark.alpha) for mark in marks]
         gains = pd.DataFrame(pairs, columns=[f"observer.{side}.{gain}" for gain in ("lambda", "alpha")])
-        axes = list_axes({"marks": gains.drop_duplicates().to_dict("list")})
-        runs = gains.merge(stages.rerun(base | {"axes": axes}, "marks", side), how="left").to_dict("records")
+        runs = stages.repeat_runs(base, gains, "marks", side).to_dict("records")
         disturbance = read_disturbance(drive, side, trace)
         starts = tuple(float(base["observer"][side][f"{name}_error"]) for name in ("position", "velocity"))
         error, friction = abs(starts[1]), disturbance.damping
