@@ -26,7 +26,6 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
-from .below_bound import summarise_converged_below
 from .counterexamples import add_causes, run_columns
 from .error_system import (
     SWITCHING_LIMIT,
@@ -37,7 +36,7 @@ from .error_system import (
     summarise_ratios,
 )
 from .loop_gains import GAIN_SECTIONS, LoopRuns
-from .marks import judge_marks
+from .own_disturbance import judge_marks, summarise_converged_below
 from .pilot import Scenarios
 from .stages import Stages, open_stages
 
