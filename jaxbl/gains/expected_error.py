@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config
 from jaxbl.config.figures import filter_rows
 from jaxbl.sweeps.sweep import sweep
 
@@ -86,7 +86,7 @@ def expect_errors(scenarios: Scenarios, sides: Sequence[str]) -> dict[str, Expec
     for key in ("figures", "tune", "uncertainty", "axes"):
         data.pop(key, None)
     data["axes"] = list_axes({"scenario": scenarios.columns, "causes": causes.columns})
-    result = sweep(read_config(data | {"sweep": {"seeds": 4}}))
+    result = sweep(data | {"sweep": {"seeds": 4}})
     paths = [*scenarios.columns, *causes.columns]
     frame = result.read([*paths, *(f"{side}.{name}_rmse" for side in sides for name in ("velocity", "position"))])
     first = filter_rows(frame, {path: values[0] for path, values in scenarios.columns.items()})

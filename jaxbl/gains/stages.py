@@ -128,10 +128,11 @@ class Stages:
 
     def describe_holdout(self, seeds: int) -> JsonObject:
         """Describe the held-out runs of :meth:`tables_of` for `tuning.json`."""
-        first, holdout = self.config.sweep.first_seed + self.config.sweep.seeds, self.table.holdout
+        tables = self.tables_of(self.config, "holdout", seeds)
+        first = tables["sweep"]["first_seed"]
         return {
-            "excitation": (holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
-            "same_excitation": holdout is None,
+            "excitation": tables["excitation"],
+            "same_excitation": self.table.holdout is None,
             "seeds": [first, first + seeds - 1],
         }
 
