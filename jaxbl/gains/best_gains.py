@@ -47,9 +47,9 @@ def find_best_gains(
     error: np.ndarray,
     works: np.ndarray,
     *,
-    allowed: np.ndarray | None = None,
+    allowed: np.ndarray,
+    scatter: np.ndarray,
     alpha_ratio: np.ndarray | None = None,
-    scatter: np.ndarray | None = None,
 ) -> BestGains | None:
     """Find the best gains, or None if none are allowed.
 
@@ -57,20 +57,20 @@ def find_best_gains(
         gains: a row for each of n candidates; the columns are `lambda`, `alpha` or others.
         error: shape (n,), the worst of all runs with these gains; NaN if one diverged.
         works: shape (n,), whether they converge in all runs.
-        allowed: shape (n,), whether they may be chosen; those that work if left out.
+        allowed: shape (n,), whether they may be chosen.
+        scatter: shape (n,), relative standard error of their mean over noise seeds.
         alpha_ratio: shape (n,), alpha over f⁺, which has to be above 1; not known if left out.
-        scatter: shape (n,), relative standard error of their mean over noise seeds; none if left out.
     """
     works = works & np.isfinite(error)
     if alpha_ratio is not None:
         works = works & (alpha_ratio > 1.0)
-    allowed = works if allowed is None else works & allowed
+    allowed = works & allowed
     if not allowed.any():
         return None
     # a gain of 0 is far from all others
     place = np.log(np.maximum(gains.to_numpy(float), np.finfo(float).tiny))
     least = int(np.argmin(np.where(allowed, error, np.inf)))
-    tolerance = AS_GOOD if scatter is None else max(AS_GOOD, scatter[least])
+    tolerance = max(AS_GOOD, scatter[least])
     as_good = np.flatnonzero(allowed & (error <= (1.0 + tolerance) * error[least]))
     good, low, high = place[as_good], place.min(axis=0), place.max(axis=0)
     is_varied = high > low
