@@ -275,7 +275,8 @@ def certify_best_gains(search: GainSearch, path: Path | None) -> JsonObject:
     """
     table = search.table.certificate
     assert table is not None
-    arguments_by_side = {side: choose_question(search, side)._asdict() | {"runs": table.runs} for side in search.sides}
+    runs: JsonObject = {"runs": table.runs}
+    arguments_by_side = {side: choose_question(search, side)._asdict() | runs for side in search.sides}
     key = {"version": version("jaxbl"), "asked": to_jsonable(arguments_by_side)}
     if path is not None:
         with suppress(FileNotFoundError, InputError):

@@ -76,11 +76,11 @@ def simulate_error_system(stages: Stages) -> ErrorSystemMap:
     with jax.enable_x64(True):
         map_ = stages.read_or_compute("normalised.parquet", compute_map)
         boundary = stages.read_or_compute("boundaries.parquet", compute_boundaries)["least_lambda_ratio"].to_numpy()
+    ratio, closed_form = (map_[name].to_numpy() for name in ("ratio", "closed_form"))
     is_far = np.abs(cells[0] / np.sqrt(8.0 * (cells[1] + 1.0)) - 1.0) > SWITCHING_LIMIT
-    difference = float((map_["ratio"] - map_["closed_form"]).abs()[is_far].max(skipna=False))
-    ratio = map_["ratio"].to_numpy().reshape(len(lambda_), -1)
+    difference = float(np.abs(ratio - closed_form)[is_far].max())
     boundaries = dict(zip(dampings, boundary.reshape(len(dampings), -1), strict=True))
-    return ErrorSystemMap(alpha, lambda_, ratio, difference, boundaries.pop(0.0), boundaries)
+    return ErrorSystemMap(alpha, lambda_, ratio.reshape(len(lambda_), -1), difference, boundaries.pop(0.0), boundaries)
 
 
 @cache
