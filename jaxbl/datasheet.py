@@ -318,7 +318,7 @@ def write_first_study(kind: DriveKind, answers: Answers, title: str) -> tuple[st
         gains = {side: usual_rule(metrics["f_plus"]) for side, metrics in pilot_metrics.items()}
         observers = {side: {"lambda": lambda_, "alpha": alpha} for side, (lambda_, alpha) in gains.items()}
         config = read_config(tomllib.loads(text) | {"observer": observers})
-        expected = expect_errors(list_scenarios(config, worst_over_uncertainty=True), list(gains))
+        expected = expect_errors(list_scenarios(config, worst_over_uncertainty=True))
         for side, metrics in pilot_metrics.items():
             metrics["expected"] = expected[side]._asdict()
         gain_map = propose_map(run_pilot(Scenarios(config))["motor"]["f_plus"])

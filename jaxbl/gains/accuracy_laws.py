@@ -259,10 +259,8 @@ class _FigureLine:
         self._rows = filter_rows(frame, fixed)
         self.x, self.y = self._geometric_means(figure.value)
         self._unknown = np.full(len(self.x), np.nan)
-        self._noise, period = (
-            self.x if figure.x == path else np.full(len(self.x), self._number_along_line(path)) for path in (NOISE, PERIOD)
-        )
-        self._signal_size, self._resolution, self._relative_velocity_error = self._signal_sizes(period)
+        self._noise = self._numbers_along_line(NOISE)
+        self._signal_size, self._resolution, self._relative_velocity_error = self._signal_sizes()
         self._noiseless_error = self._unknown
         if NOISE in (figure.x, *fixed):
             # along the noise axis this is one number, the floor
@@ -272,13 +270,13 @@ class _FigureLine:
         self._exponent_of_period = self._period_exponent() if figure.x == NOISE else self._unknown
         self.usable = np.array([self._find_other_cause(i, True) is None for i in range(len(self.x))], dtype=bool)
 
-    def _number_along_line(self, path: str) -> float:
-        """Return the number at a path if it is the same along the line, else NaN."""
-        if path in self._rows:
-            numbers = self._rows[path].unique()
-            return float(numbers[0]) if len(numbers) == 1 else math.nan
+    def _numbers_along_line(self, path: str) -> np.ndarray:
+        """Return the number at a path at each point; NaN for one that is not the line's x and varies."""
+        if path == self._figure.x:
+            return self.x
         section, key = path.split(".")
-        return float(getattr(getattr(self._config, section), key))
+        numbers = self._rows[path].unique() if path in self._rows else [getattr(getattr(self._config, section), key)]
+        return np.full(len(self.x), float(numbers[0]) if len(numbers) == 1 else math.nan)
 
     def _geometric_means(self, column: str, changes: dict[str, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return each x > 0 of the line and the geometric mean of a column over the seeds there.
@@ -294,7 +292,7 @@ class _FigureLine:
             means = np.exp(np.log(sizes).groupby(rows[path], sort=True).agg(lambda logs: logs.mean(skipna=False)))
         return means.index.to_numpy(float), means.to_numpy(float)
 
-    def _signal_sizes(self, period: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _signal_sizes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the size of the true signal, its float resolution, and the relative velocity error; NaN where unknown.
 
         A reading is rounded to eps times the position. A velocity is a change of readings divided by the period.
@@ -307,7 +305,7 @@ class _FigureLine:
         eps = float(np.finfo(self._config.run.precision).eps)
         if _SIGNAL_BY_METRIC[column.rpartition(".")[2]] == "position":
             return position, eps * position, velocity_error / velocity
-        return velocity, eps * (position / period + velocity), velocity_error / velocity
+        return velocity, eps * (position / self._numbers_along_line(PERIOD) + velocity), velocity_error / velocity
 
     def _period_exponent(self) -> np.ndarray:
         """Return the exponent of the error in the sampling period at each x, from the nearest other period; NaN without."""

@@ -47,9 +47,9 @@ def find_best_gains(
     error: np.ndarray,
     works: np.ndarray,
     *,
-    allowed: np.ndarray | None = None,
+    allowed: np.ndarray,
+    scatter: np.ndarray,
     alpha_ratio: np.ndarray | None = None,
-    scatter: np.ndarray | None = None,
 ) -> BestGains | None:
     """Find the best gains, or None if none are allowed.
 
@@ -57,42 +57,40 @@ def find_best_gains(
         gains: a row for each of n candidates; the columns are `lambda`, `alpha` or others.
         error: shape (n,), the worst of all runs with these gains; NaN if one diverged.
         works: shape (n,), whether they converge in all runs.
-        allowed: shape (n,), whether they may be chosen; those that work if left out.
+        allowed: shape (n,), whether they may be chosen.
+        scatter: shape (n,), relative standard error of their mean over noise seeds.
         alpha_ratio: shape (n,), alpha over f⁺, which has to be above 1; not known if left out.
-        scatter: shape (n,), relative standard error of their mean over noise seeds; none if left out.
     """
     works = works & np.isfinite(error)
     if alpha_ratio is not None:
         works = works & (alpha_ratio > 1.0)
-    allowed = works if allowed is None else works & allowed
+    allowed = works & allowed
     if not allowed.any():
         return None
     # a gain of 0 is far from all others
     place = np.log(np.maximum(gains.to_numpy(float), np.finfo(float).tiny))
     least = int(np.argmin(np.where(allowed, error, np.inf)))
-    tolerance = AS_GOOD if scatter is None else max(AS_GOOD, scatter[least])
+    tolerance = max(AS_GOOD, scatter[least])
     as_good = np.flatnonzero(allowed & (error <= (1.0 + tolerance) * error[least]))
-    low, high = place.min(axis=0), place.max(axis=0)
+    good, low, high = place[as_good], place.min(axis=0), place.max(axis=0)
     is_varied = high > low
     # below the smallest alpha, its ratio to f⁺ is the margin
     counts_below = is_varied & ((gains.columns != "alpha") | (alpha_ratio is None))
-    to_ends = np.minimum(
-        np.where(is_varied, high - place[as_good], np.inf).min(axis=1),
-        np.where(counts_below, place[as_good] - low, np.inf).min(axis=1),
-    )
-    margins = {
-        "f_plus": np.full(len(as_good), np.inf) if alpha_ratio is None else alpha_ratio[as_good],
-        "failure": np.exp(np.minimum(_distances(place[as_good], place[~works]), to_ends)),
-        "error": np.exp(np.minimum(_distances(place[as_good], place[works & (error >= _DOUBLED * error[least])]), to_ends)),
-    }
+    to_ends = np.minimum(np.where(is_varied, high - good, np.inf), np.where(counts_below, good - low, np.inf)).min(axis=1)
+    margins = {"f_plus": np.full(len(good), np.inf) if alpha_ratio is None else alpha_ratio[as_good]}
+    for name, too_far in (("failure", ~works), ("error", works & (error >= _DOUBLED * error[least]))):
+        # infinite without such gains
+        nearest = KDTree(place[too_far]).query(good, p=np.inf)[0] if too_far.any() else np.inf
+        margins[name] = np.exp(np.minimum(nearest, to_ends))
     # of equal margins that with the smaller error
     margin = np.minimum.reduce(list(margins.values()))
     chosen = int(np.lexsort((error[as_good], -margin))[0])
-    ends = {}
-    for name, column, smallest, largest in zip(gains.columns, place[as_good].T, low, high, strict=True):
-        for way, end in (("smaller", smallest), ("larger", largest)):
-            if smallest < largest and (column == end).all():
-                ends[str(name)] = way
+    ends = {
+        str(name): way
+        for i, name in enumerate(gains)
+        for way, end in (("smaller", low), ("larger", high))
+        if is_varied[i] and (good[:, i] == end[i]).all()
+    }
     return BestGains(
         index=int(as_good[chosen]),
         least_error=float(error[least]),
@@ -100,8 +98,3 @@ def find_best_gains(
         nearly_as_good=int((works & (error <= (1.0 + NEARLY_AS_GOOD) * error[least])).sum()),
         ends=ends,
     )
-
-
-def _distances(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return the largest difference of a coordinate to the nearest target; infinite without targets."""
-    return KDTree(targets).query(points, p=np.inf)[0] if len(targets) else np.full(len(points), np.inf)

@@ -89,10 +89,11 @@ def certify(
         True
     """
     position_error = noise if position_error is None else position_error
-    assumptions = Assumptions(discretisation, period, f_plus, noise, velocity_error, position_error, acceleration)
-    system, start, proof, bounds, proven_accuracy, proven_time, limits = _prove(
-        lambda_, alpha, assumptions, accuracy, reaching_time
-    )
+    question = Question(
+        lambda_, alpha, discretisation, period, f_plus, noise, velocity_error, position_error, acceleration, accuracy,
+        reaching_time,
+    )  # fmt: skip
+    system, start, proof, bounds, proven_accuracy, proven_time, limits = _prove(question)
     speed = f_plus * period
     adversary = search_violations(system, *start, proof, proven_accuracy / speed, runs, seed)
     numbers = (lambda_, alpha, f_plus, start[0] * speed * period, velocity_error)
@@ -105,7 +106,7 @@ def certify(
         "certified": refusal is None,
         "why_none": refusal,
         "gains": {"lambda": lambda_, "alpha": alpha},
-        "assumptions": assumptions.to_dict(),
+        "assumptions": question.list_assumptions(),
         "accuracy": proven_accuracy,
         "reaching_time": proven_time,
         "final_accuracy": bounds[-1],
@@ -124,9 +125,11 @@ def certify(
     })  # fmt: skip
 
 
-class Assumptions(NamedTuple):
-    """The assumptions of a certificate: arguments of :func:`certify` in SI units."""
+class Question(NamedTuple):
+    """What a certificate is asked for: arguments of :func:`certify` in SI units."""
 
+    lambda_: float
+    alpha: float
     discretisation: str
     period: float
     f_plus: float
@@ -134,12 +137,16 @@ class Assumptions(NamedTuple):
     velocity_error: float
     position_error: float
     acceleration: float
+    accuracy: float | None
+    reaching_time: float | None
 
-    def to_dict(self) -> JsonObject:
-        """The table `assumptions` of a certificate."""
+    def list_assumptions(self) -> JsonObject:
+        """Return the table `assumptions` of a certificate."""
         assumptions = self._asdict()
+        for name in ("lambda_", "alpha", "accuracy", "reaching_time"):
+            del assumptions[name]
         if self.discretisation == "implicit":
-            assumptions.pop("acceleration")
+            del assumptions["acceleration"]
         return assumptions
 
 
@@ -166,22 +173,20 @@ class _ScaledProof(NamedTuple):
     limits: JsonObject
 
 
-def _prove(
-    lambda_: float, alpha: float, assumptions: Assumptions, accuracy: float | None, reaching_time: float | None
-) -> _ScaledProof:
-    f_plus, period = assumptions.f_plus, assumptions.period
-    if assumptions.discretisation not in DISCRETISATIONS:
-        raise InputError(
-            f"discretisation: '{assumptions.discretisation}' is unknown; it should be one of {', '.join(DISCRETISATIONS)}"
-        )
-    numbers = {"lambda": lambda_, "alpha": alpha, "accuracy": accuracy} | assumptions._asdict()
-    del numbers["discretisation"]
-    for name, value in numbers.items():
-        if value is None or (0.0 < value < math.inf):
+def _prove(question: Question) -> _ScaledProof:
+    lambda_, alpha, discretisation, period, f_plus, noise, velocity_error, position_error, acceleration, accuracy, _ = (
+        question
+    )
+    if discretisation not in DISCRETISATIONS:
+        known = ", ".join(DISCRETISATIONS)
+        raise InputError(f"discretisation: '{discretisation}' is unknown; it should be one of {known}")
+    for name, value in question._asdict().items():
+        if name in ("discretisation", "reaching_time") or value is None or (0.0 < value < math.inf):
             continue
         is_divisor = name in ("f_plus", "period", "accuracy")
         if is_divisor or value != 0.0:
-            raise InputError(f"{name}: a certificate needs a finite number {'>' if is_divisor else '>='} 0, not {value}")
+            sign = ">" if is_divisor else ">="
+            raise InputError(f"{name.rstrip('_')}: a certificate needs a finite number {sign} 0, not {value}")
     ratio = float(call_in_float64(peak_ratio, lambda_, alpha, f_plus))
     if alpha <= f_plus:
         raise NoResult(f"alpha = {alpha:.4g} rad/s² does not exceed f⁺ = {f_plus:.4g} rad/s²: the error need not shrink")
@@ -191,35 +196,38 @@ def _prove(
             "times the one before"
         )
     speed, length = f_plus * period, f_plus * period * period
-    implicit = assumptions.discretisation == "implicit"
-    push = 0.0 if implicit else assumptions.acceleration / f_plus
-    system = ErrorSystem(implicit, lambda_ / math.sqrt(f_plus), alpha / f_plus, assumptions.noise / length, push)
-    start = assumptions.position_error / length, assumptions.velocity_error / speed
+    implicit = discretisation == "implicit"
+    push = 0.0 if implicit else acceleration / f_plus
+    system = ErrorSystem(implicit, lambda_ / math.sqrt(f_plus), alpha / f_plus, noise / length, push)
+    start = position_error / length, velocity_error / speed
     proof = prove(system, *start)
     bounds = proof.bounds * speed
     # compared in rad/s: in units of f⁺ T rounding could put the accuracy below the last bound
     proven_accuracy = _SETTLED_RATIO * float(bounds[-1]) if accuracy is None or accuracy < bounds[-1] else accuracy
     proven_time = int((bounds <= proven_accuracy).argmax()) * period
-    asked = {"accuracy": (accuracy, bounds[-1]), "reaching_time": (reaching_time, proven_time)}
+    asked = {"accuracy": (accuracy, bounds[-1]), "reaching_time": (question.reaching_time, proven_time)}
     limits = {
         name: {"asked": limit, "met": bool(proven <= limit)} for name, (limit, proven) in asked.items() if limit is not None
     }
     return _ScaledProof(system, start, proof, bounds, proven_accuracy, proven_time, limits)
 
 
-def choose_assumptions(search: GainSearch, side: str, f_plus: float) -> Assumptions:
-    """Return the assumptions for a side of a tuned study: those of `[tune.certificate]`, else the study's and its pilot's.
-
-    `f_plus` is the largest one along the runs, rad/s^2.
-    """
-    config, pilot, side_table = search.scenarios.config, search.pilot[side], _side_table(search, side)
+def choose_question(search: GainSearch, side: str) -> Question:
+    """Return the question for the best gains of a side: assumptions and limits of `[tune.certificate]`, else the study's
+    assumptions and its pilot's."""
+    config, pilot, best = search.scenarios.config, search.pilot[side], search.best_candidate(side)
+    table = search.table.certificate
+    assert table is not None
+    side_table = getattr(table, side) or SideCertificateTable()
     encoders = config.encoders.build()
     rms = float(encoders.noise_of(side, config.drive.build().ratio(side)))
     count = encoders.resolution_of(side)
-    stated = side_table.model_dump(exclude={"accuracy", "reaching_time"}, exclude_none=True)
-    f_plus = stated.get("f_plus", max(search.f_plus[side], f_plus, pilot["start"]))
+    stated = side_table.model_dump(exclude_none=True)
+    f_plus = stated.get("f_plus", max(search.f_plus[side], best["f_plus"], pilot["start"]))
     noise = stated.get("noise", 0.5 * float(count) + _NOISE_RMS_FACTOR * rms)
-    return Assumptions(
+    return Question(
+        float(best["lambda"]),
+        float(best["alpha"]),
         config.observer.discretisation,
         config.run.sample_period,
         f_plus,
@@ -227,13 +235,9 @@ def choose_assumptions(search: GainSearch, side: str, f_plus: float) -> Assumpti
         abs(pilot["velocity_error"]),
         max(abs(pilot["position_error"]), noise),
         pilot["largest_acceleration"] + f_plus,
+        None,
+        None,
     )._replace(**stated)
-
-
-def _side_table(search: GainSearch, side: str) -> SideCertificateTable:
-    table = search.table.certificate
-    assert table is not None
-    return getattr(table, side) or SideCertificateTable()
 
 
 _MOST_ATTEMPTS = 50
@@ -247,21 +251,18 @@ def choose_certified_gains(search: GainSearch) -> dict[str, int]:
     """
     passed_over = {}
     for side in search.sides:
-        side_table, frame = _side_table(search, side), search.candidates[side]
+        frame = search.candidates[side]
         feasible_before, passed_over[side] = frame["feasible"].copy(), 0
-        asked = side_table.accuracy, side_table.reaching_time
-        if asked == (None, None):
-            continue
         pair_count = frame[feasible_before].groupby(["lambda", "alpha"]).ngroups
         for attempt in range(min(pair_count, _MOST_ATTEMPTS)):
-            best = search.best_candidate(side)
-            assumptions = choose_assumptions(search, side, best["f_plus"])
+            question = choose_question(search, side)
+            if question.accuracy is None and question.reaching_time is None:
+                break
             with suppress(NoResult):
-                limits = _prove(best["lambda"], best["alpha"], assumptions, *asked).limits
-                if all(limit["met"] for limit in limits.values()):
+                if all(limit["met"] for limit in _prove(question).limits.values()):
                     passed_over[side] = attempt
                     break
-            frame.loc[(frame["lambda"] == best["lambda"]) & (frame["alpha"] == best["alpha"]), "feasible"] = False
+            frame.loc[(frame["lambda"] == question.lambda_) & (frame["alpha"] == question.alpha), "feasible"] = False
         else:
             frame["feasible"] = feasible_before
     return passed_over
@@ -274,17 +275,8 @@ def certify_best_gains(search: GainSearch, path: Path | None) -> JsonObject:
     """
     table = search.table.certificate
     assert table is not None
-    arguments_by_side = {}
-    for side in search.sides:
-        best, side_table = search.best_candidate(side), _side_table(search, side)
-        arguments_by_side[side] = {
-            "lambda_": float(best["lambda"]),
-            "alpha": float(best["alpha"]),
-            "runs": table.runs,
-            **choose_assumptions(search, side, best["f_plus"])._asdict(),
-            "accuracy": side_table.accuracy,
-            "reaching_time": side_table.reaching_time,
-        }
+    runs: JsonObject = {"runs": table.runs}
+    arguments_by_side = {side: choose_question(search, side)._asdict() | runs for side in search.sides}
     key = {"version": version("jaxbl"), "asked": to_jsonable(arguments_by_side)}
     if path is not None:
         with suppress(FileNotFoundError, InputError):

@@ -10,7 +10,6 @@ from jaxbl.config import Config, read_config
 from jaxbl.json_types import JsonObject
 from jaxbl.sweeps.points import Points
 
-from .pilot import list_axes
 from .stages import Stages, set_keys
 
 _MOST_REPEATED = 4096
@@ -69,7 +68,7 @@ def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stage
         remedies = _list_remedies(tables["run"], level)
         helps = {}
         for cause, remedy in remedies.items():
-            frame = repeat_runs(tables, paths, group, remedy, stages, f"{name}-{cause}")
+            frame = repeat_with_change(tables, paths, group, remedy, stages, f"{name}-{cause}")
             if frame is not None:
                 helps[cause] = frame[f"{side}.converged"].to_numpy(bool)
         causes[group.index] = [" or ".join(cause for cause in helps if helps[cause][i]) for i in range(len(group))]
@@ -77,7 +76,7 @@ def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stage
         if not len(failing):
             continue
         all_remedies = {path: value for remedy in remedies.values() for path, value in remedy.items()}
-        frame = repeat_runs(tables, paths, failing, all_remedies, stages, f"{name}-several")
+        frame = repeat_with_change(tables, paths, failing, all_remedies, stages, f"{name}-several")
         assert frame is not None, "a longer run has an effect"
         # a failing observer can lower its own f_plus; once it works, alpha turns out to be too small
         other_causes = np.where(frame[f"{side}.margin_alpha"] <= 1.0, "f_plus underestimated", "unexplained")
@@ -85,7 +84,7 @@ def _find_causes(study: Config, level: str, side: str, rows: pd.DataFrame, stage
     return causes
 
 
-def repeat_runs(
+def repeat_with_change(
     tables: JsonObject, paths: list[str], rows: pd.DataFrame, change: JsonObject, stages: Stages, name: str
 ) -> pd.DataFrame | None:
     """Repeat runs with changed keys, as a study of listed points. Returns None if the change has no effect.
@@ -102,11 +101,5 @@ def repeat_runs(
     before, after = (read_config(study | {"axes": []}).to_dict() for study in (tables, data))
     if unchanged_paths == paths and before == after:
         return None
-    points = rows[unchanged_paths].drop_duplicates()
-    data["axes"] = list_axes({"runs": points.to_dict("list")})
     data["sweep"] = {key: data["sweep"][key] for key in ("seeds", "first_seed")}
-    frame = stages.rerun(read_config(data), "causes", name.replace(" ", "_"))
-    labels, wanted_labels = (pd.MultiIndex.from_frame(runs[[*unchanged_paths, "seed"]]) for runs in (frame, rows))
-    positions = labels.get_indexer(wanted_labels)
-    assert (positions >= 0).all(), "a run was not repeated"
-    return frame.iloc[positions]
+    return stages.repeat_runs(data, rows[[*unchanged_paths, "seed"]], "causes", name.replace(" ", "_"))

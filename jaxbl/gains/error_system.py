@@ -2,6 +2,7 @@
 and the least lambda of each gain condition."""
 
 import dataclasses
+from collections.abc import Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -10,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from jaxbl.chain import NamedArrays
 from jaxbl.config import Config
 from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS, Condition, least_lambda_davila_fridman, peak_ratio
@@ -31,7 +31,7 @@ class ErrorSystemMap:
         alpha: alpha / f_plus, shape (alphas,).
         lambda_: lambda / sqrt(f_plus), shape (lambdas,).
         ratio: simulated ratio of successive velocity peaks, shape (lambdas, alphas).
-        closed_form: the ratio by the closed form.
+        difference: largest one between simulated and closed-form ratio, away from the switching limit.
         boundary: least lambda at which the simulated peaks fall, by bisection, shape (alphas,).
         boundary_by_damping: the same under viscous damping (friction / inertia x speed / f_plus).
     """
@@ -39,16 +39,9 @@ class ErrorSystemMap:
     alpha: np.ndarray
     lambda_: np.ndarray
     ratio: np.ndarray
-    closed_form: np.ndarray
+    difference: float
     boundary: np.ndarray
     boundary_by_damping: dict[float, np.ndarray]
-
-    @property
-    def difference(self) -> float:
-        """The largest difference between simulated and closed-form ratio away from the switching limit."""
-        edge = np.sqrt(8.0 * (self.alpha + 1.0))
-        far = np.abs(self.lambda_[:, None] / edge - 1.0) > SWITCHING_LIMIT
-        return float(np.abs(self.ratio - self.closed_form)[far].max())
 
 
 @jax.jit
@@ -68,7 +61,6 @@ def simulate_error_system(stages: Stages) -> ErrorSystemMap:
     settings = stages.config.verify
     alpha, lambda_ = settings.alpha_ratio.values(), settings.lambda_ratio.values()
     cells = [c.ravel() for c in np.meshgrid(lambda_, alpha, indexing="ij")]
-    shape = (len(lambda_), len(alpha))
     dampings = [0.0, *settings.damping]
 
     def compute_map() -> pd.DataFrame:
@@ -84,14 +76,16 @@ def simulate_error_system(stages: Stages) -> ErrorSystemMap:
     with jax.enable_x64(True):
         map_ = stages.read_or_compute("normalised.parquet", compute_map)
         boundary = stages.read_or_compute("boundaries.parquet", compute_boundaries)["least_lambda_ratio"].to_numpy()
-    ratio, closed_form = (map_[name].to_numpy().reshape(shape) for name in ("ratio", "closed_form"))
+    ratio, closed_form = (map_[name].to_numpy() for name in ("ratio", "closed_form"))
+    is_far = np.abs(cells[0] / np.sqrt(8.0 * (cells[1] + 1.0)) - 1.0) > SWITCHING_LIMIT
+    difference = float(np.abs(ratio - closed_form)[is_far].max())
     boundaries = dict(zip(dampings, boundary.reshape(len(dampings), -1), strict=True))
-    return ErrorSystemMap(alpha, lambda_, ratio, closed_form, boundaries.pop(0.0), boundaries)
+    return ErrorSystemMap(alpha, lambda_, ratio.reshape(len(lambda_), -1), difference, boundaries.pop(0.0), boundaries)
 
 
 @cache
-def _conditions_with_q(q: float | None) -> dict[str, Condition]:
-    """Cached, as compiled programs are by the function."""
+def list_conditions(q: float | None) -> dict[str, Condition]:
+    """Return the gain conditions by name, with the study's q in (32); cached, as compiled programs are by the function."""
     if q is None:
         return CONDITIONS
     return CONDITIONS | {
@@ -99,29 +93,26 @@ def _conditions_with_q(q: float | None) -> dict[str, Condition]:
     }
 
 
-def list_conditions(config: Config) -> dict[str, Condition]:
-    """Return the gain conditions by name, with the study's q in (32)."""
-    return _conditions_with_q(config.verify.q)
+def judge_conditions(
+    q: float | None, lambda_: np.ndarray, alpha: np.ndarray, f_plus: np.ndarray, converged: np.ndarray
+) -> Iterator[tuple[JsonObject, np.ndarray, np.ndarray]]:
+    """Count the runs that each gain condition judges rightly and wrongly, with the study's q in (32).
 
-
-def demanded_lambda(config: Config, alpha: np.ndarray, f_plus: np.ndarray) -> NamedArrays:
-    """Return each condition's least lambda (rad^0.5/s) at alpha and f_plus (rad/s^2), with the study's q in (32)."""
-    with jax.enable_x64(True):
-        return {
-            name: apply_elementwise(condition.least_lambda, [alpha, f_plus])
-            for name, condition in list_conditions(config).items()
+    Yields for each condition its counts, where it holds, and the least lambda (rad^0.5/s) that it demands. Alpha and f_plus
+    (rad/s^2) have one shape, to which those of lambda and `converged` broadcast.
+    """
+    for name, condition in list_conditions(q).items():
+        with jax.enable_x64(True):
+            demanded = apply_elementwise(condition.least_lambda, [alpha, f_plus])
+        holds = lambda_ > demanded
+        counts = {
+            "name": name,
+            "title": condition.title,
+            "holds": int(holds.sum()),
+            "counterexamples": int((holds & ~converged).sum()),
+            "fails_but_converged": int((~holds & converged).sum()),
         }
-
-
-def count_judgements(config: Config, name: str, holds: np.ndarray, converged: np.ndarray) -> JsonObject:
-    """Count the runs that a condition judges rightly and wrongly, from bool arrays of one shape."""
-    return {
-        "name": name,
-        "title": list_conditions(config)[name].title,
-        "holds": int(holds.sum()),
-        "counterexamples": int((holds & ~converged).sum()),
-        "fails_but_converged": int((~holds & converged).sum()),
-    }
+        yield counts, holds, demanded
 
 
 def summarise_ratios(ratios: np.ndarray, at_least: int = 0) -> JsonObject:
@@ -132,14 +123,13 @@ def summarise_ratios(ratios: np.ndarray, at_least: int = 0) -> JsonObject:
 
 def judge_error_system(config: Config, error_map: ErrorSystemMap) -> JsonObject:
     """Count the cells of the plane by condition: a level of `verdict.json`."""
-    converged = error_map.ratio < 1.0
-    conditions = []
-    for name, demanded in demanded_lambda(config, error_map.alpha, np.ones_like(error_map.alpha)).items():
-        judgement = count_judgements(config, name, error_map.lambda_[:, None] > demanded, converged)
-        conditions.append(judgement | {"conservatism": summarise_ratios(demanded / error_map.boundary)})
+    converged, alpha = error_map.ratio < 1.0, error_map.alpha
+    judgements = judge_conditions(config.verify.q, error_map.lambda_[:, None], alpha, np.ones_like(alpha), converged)
     return {
         "level": "normalised",
         "cells": error_map.ratio.size,
         "converged": int(converged.sum()),
-        "conditions": conditions,
+        "conditions": [
+            counts | {"conservatism": summarise_ratios(demanded / error_map.boundary)} for counts, _, demanded in judgements
+        ],
     }

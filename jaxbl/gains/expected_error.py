@@ -3,13 +3,12 @@
 # pandas' own annotations are wider than what its methods return
 # pyright: reportArgumentType=false
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from jaxbl.config import Config, read_config
+from jaxbl.config import Config
 from jaxbl.config.figures import filter_rows
 from jaxbl.sweeps.sweep import sweep
 
@@ -76,7 +75,7 @@ class ExpectedError(NamedTuple):
     largest_position: float
 
 
-def expect_errors(scenarios: Scenarios, sides: Sequence[str]) -> dict[str, ExpectedError]:
+def expect_errors(scenarios: Scenarios) -> dict[str, ExpectedError]:
     """Expect the errors of a study's observers, by side, from runs of drives with the study's own gains.
 
     Raises:
@@ -86,8 +85,9 @@ def expect_errors(scenarios: Scenarios, sides: Sequence[str]) -> dict[str, Expec
     for key in ("figures", "tune", "uncertainty", "axes"):
         data.pop(key, None)
     data["axes"] = list_axes({"scenario": scenarios.columns, "causes": causes.columns})
-    result = sweep(read_config(data | {"sweep": {"seeds": 4}}))
+    result = sweep(data | {"sweep": {"seeds": 4}})
     paths = [*scenarios.columns, *causes.columns]
+    sides = scenarios.config.sides
     frame = result.read([*paths, *(f"{side}.{name}_rmse" for side in sides for name in ("velocity", "position"))])
     first = filter_rows(frame, {path: values[0] for path, values in scenarios.columns.items()})
     return {

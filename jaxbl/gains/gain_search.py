@@ -119,9 +119,8 @@ class GainSearch:
         for side in self.sides:
             for gain, way in self.find_best(side).ends.items():
                 if self.limits[gain] == defaults[gain]:
-                    limits[gain] = (
-                        (_WIDEST[gain][0], limits[gain][1]) if way == "smaller" else (limits[gain][0], _WIDEST[gain][1])
-                    )
+                    (low, high), (least, largest) = limits[gain], _WIDEST[gain]
+                    limits[gain] = (least, high) if way == "smaller" else (low, largest)
         if limits == self.limits:
             return False
         self.limits, self.windows = limits, [dict.fromkeys(self.sides, limits)]
@@ -270,23 +269,15 @@ class GainSearch:
         gains_by_name = self._list_named_gains()
         # gains of two names may be the same, points of a study may not
         unique = list({tuple(gains.values()): gains for gains in gains_by_name.values()}.values())
-        columns = {
-            f"observer.{side}.{key}": [gains[side][i] for gains in unique]
-            for side in self.sides
-            for i, key in enumerate(("lambda", "alpha"))
-        }
-        frame = self._run_study("holdout" if held_out else "named", {"gains": columns}, held_out=held_out)
-        worst_by_side = {
-            side: self._reduce_to_worst(frame, side, pilot["holdout_f_plus" if held_out else "f_plus"])
-            for side, pilot in self.pilot.items()
-        }
+        frame = self._run_study("holdout" if held_out else "named", {"gains": _gain_columns(unique)}, held_out=held_out)
         rows = []
         for name, gains in gains_by_name.items():
             for side, (lambda_, alpha) in gains.items():
-                worst = worst_by_side[side].set_index(["lambda", "alpha"]).loc[gains[side]]
                 is_pair = (frame[f"observer.{side}.lambda"] == lambda_) & (frame[f"observer.{side}.alpha"] == alpha)
                 # another pair may share this side's gains: its runs are the same
                 runs = frame[is_pair].drop_duplicates([*self.scenarios.columns, "seed"])
+                bound = self.pilot[side]["holdout_f_plus" if held_out else "f_plus"]
+                worst = self._reduce_to_worst(runs, side, bound).iloc[0]
                 rows.append({
                     "name": name, "side": side, "lambda": lambda_, "alpha": alpha, "runs": len(runs),
                     "converged": runs[f"{side}.converged"].mean(), "finite": runs["finite"].mean(),
@@ -301,12 +292,7 @@ class GainSearch:
 
     def split_error(self) -> dict[str, dict[str, float]]:
         """Split the mean square error of the best gains by its causes (:class:`.expected_error.Causes`), by side."""
-        causes = list_causes(self.scenarios.config)
-        gains = {
-            f"observer.{side}.{gain}": [row[gain]]
-            for side, row in self.best_candidates().items()
-            for gain in ("lambda", "alpha")
-        }
+        causes, gains = list_causes(self.scenarios.config), _gain_columns([self._list_named_gains()["tuned"]])
         frame = self._run_study("causes", {"gains": gains, "causes": causes.columns})
         return {side: causes.split(frame, f"{side}.{self.table.objective}_rmse")[1] for side in self.sides}
 
@@ -320,3 +306,12 @@ class GainSearch:
         result = self.stages.run(data, name)
         names = [f"{side}.{metric}" for side in self.sides for metric in ("converged", *GAIN_METRICS)]
         return result.read([*(axis["path"] for axis in data["axes"]), "seed", "finite", *names])
+
+
+def _gain_columns(pairs: list[Gains]) -> dict[str, list[float]]:
+    """Return columns of an axis, by path, whose rows are these gains."""
+    return {
+        f"observer.{side}.{key}": [gains[side][i] for gains in pairs]
+        for side in pairs[0]
+        for i, key in enumerate(("lambda", "alpha"))
+    }

@@ -80,7 +80,7 @@ def complete_study(data: JsonObject, record: Record, written: Config) -> JsonObj
     with suppress(InputError, NoResult):
         scenarios = Scenarios(read_config(data))
         pilot = run_pilot(scenarios)
-        tolerances = propose_tolerances(scenarios.config, expect_errors(scenarios, list(pilot)))
+        tolerances = propose_tolerances(scenarios.config, expect_errors(scenarios))
         data["run"] |= {key: value for key, value in tolerances.items() if key not in written.run.model_fields_set}
         if not written.axes and pilot["motor"]["f_plus"] > 0.0:
             data |= propose_map(pilot["motor"]["f_plus"])

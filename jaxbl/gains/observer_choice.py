@@ -168,11 +168,14 @@ class _KindSearch:
                     worst = errors.max(axis=1).reshape(len(searches), len(unit))
                     for sides, trial, trial_errors in zip(searches, trials, worst, strict=True):
                         sides[side].zoom_in(trial[side], trial_errors)
-            solved = [point for point in points if all(search.best for search in point.searches[kind].values())]
-            rows = [(point, {side: search.best for side, search in point.searches[kind].items()}) for point in solved]
+            rows = [
+                (point, {side: search.best for side, search in sides.items()})
+                for point, sides in zip(points, searches, strict=True)
+                if all(search.best for search in sides.values())
+            ]
             errors_by_side = self._run_trials(kind, f"{number}-holdout", rows, held_out=True) if rows else {}
             for side, errors in errors_by_side.items():
-                for point, held_out in zip(solved, errors, strict=True):
+                for (point, _), held_out in zip(rows, errors, strict=True):
                     point.searches[kind][side].held_out = held_out
 
     def _start_searches(self, kind: str, point: MapPoint) -> dict[str, SideSearch]:

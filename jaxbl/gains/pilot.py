@@ -34,8 +34,7 @@ def list_scenarios(config: Config, worst_over_uncertainty: bool) -> Scenarios:
     if not worst_over_uncertainty:
         return Scenarios(config)
     data, relative = config.to_dict(), config.uncertainty.relative
-    effects: list[JsonObject] = data.setdefault("effects", [])
-    errors_by_number: dict[str, list[tuple[int, str, float]]] = {}
+    effects, errors = data["effects"], []
     for number, side in itertools.product(("inertia", "viscous"), config.build().sides):
         nominal = getattr(config.drive, f"{side}_{number}")
         if f"drive.{side}_{number}" in config.uncertainty.exact or nominal == 0.0:
@@ -51,27 +50,26 @@ def list_scenarios(config: Config, worst_over_uncertainty: bool) -> Scenarios:
         if not indices:
             effects.append({"kind": kind, key: 0.0})
             indices = [len(effects) - 1]
-        errors_by_number.setdefault(number, []).append((indices[0], key, relative * nominal))
-    if not errors_by_number:
+        errors.append((number, indices[0], key, relative * nominal))
+    if not errors:
         return Scenarios(config)
-    count = len(errors_by_number)
-    signs_by_corner = [(0,) * count, *itertools.product((-1, 1), repeat=count)]
-    corners = [dict(zip(errors_by_number, signs, strict=True)) for signs in signs_by_corner]
+    numbers = dict.fromkeys((number for number, *_ in errors), 0)
+    signs_by_corner = itertools.product((-1, 1), repeat=len(numbers))
+    corners = [numbers, *(dict(zip(numbers, signs, strict=True)) for signs in signs_by_corner)]
     kinds = [effect["kind"] for effect in effects]
     columns = {}
-    for number, errors in errors_by_number.items():
-        for index, key, size in errors:
-            label = kinds[index] if kinds.count(kinds[index]) == 1 else str(index)
-            columns[f"effects.{label}.{key}"] = [effects[index][key] + corner[number] * size for corner in corners]
+    for number, index, key, size in errors:
+        label = kinds[index] if kinds.count(kinds[index]) == 1 else str(index)
+        columns[f"effects.{label}.{key}"] = [effects[index][key] + corner[number] * size for corner in corners]
     percent = f"{100.0 * relative:.3g} %"
-    names = [
-        ", ".join(f"{number} {'+' if sign > 0 else '-'}{percent}" for number, sign in corner.items() if sign)
+    names = tuple(
+        ", ".join(f"{number} {'+' if sign > 0 else '-'}{percent}" for number, sign in corner.items() if sign) or "nominal"
         for corner in corners
-    ]
+    )
     # uncertainty.exact may name effects by labels that have changed
     data.pop("uncertainty")
     config = read_config(data).model_copy(update={"uncertainty": config.uncertainty})
-    return Scenarios(config, ("nominal", *names[1:]), columns)
+    return Scenarios(config, names, columns)
 
 
 def list_axes(columns_by_label: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[JsonObject]:

@@ -18,7 +18,9 @@ from jaxbl.observer.base import AbstractObserver, ObserverState
 
 States = Float[np.ndarray, "states size"]
 """Errors of position, velocity and further states of an observer: the true value less the predicted one."""
-Step = Callable[[States, Float[np.ndarray, " states"]], tuple[States, Float[np.ndarray, " states"]]]
+PerState = Float[np.ndarray, " states"]
+"""One number for each of several states."""
+Step = Callable[[States, PerState], tuple[States, PerState]]
 """Maps errors before a sample and its noise to the errors before the next sample without acceleration, and to the error of
 the velocity estimate."""
 
@@ -69,7 +71,7 @@ def build_error_step(observer: AbstractObserver) -> Step:
     x64 must be enabled. The observer's states must be zero at rest, as in super-twisting observers and differentiators.
     """
 
-    def step(states: States, noise: Float[np.ndarray, " states"]) -> tuple[States, Float[np.ndarray, " states"]]:
+    def step(states: States, noise: PerState) -> tuple[States, PerState]:
         count = len(noise)
         # batches of one size are compiled once
         padded = np.pad(np.column_stack([states, noise]).T, ((0, 0), (0, -count % _LANES)))

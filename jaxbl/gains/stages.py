@@ -128,10 +128,11 @@ class Stages:
 
     def describe_holdout(self, seeds: int) -> JsonObject:
         """Describe the held-out runs of :meth:`tables_of` for `tuning.json`."""
-        first, holdout = self.config.sweep.first_seed + self.config.sweep.seeds, self.table.holdout
+        tables = self.tables_of(self.config, "holdout", seeds)
+        first = tables["sweep"]["first_seed"]
         return {
-            "excitation": (holdout or self.config.excitation).model_dump(by_alias=True, exclude_none=True),
-            "same_excitation": holdout is None,
+            "excitation": tables["excitation"],
+            "same_excitation": self.table.holdout is None,
             "seeds": [first, first + seeds - 1],
         }
 
@@ -224,11 +225,23 @@ class Stages:
         runs = trials.assign(row=range(len(trials))).merge(frame, on=paths).sort_values(["row", "seed"])
         return {metric: runs[metric].to_numpy(float).reshape(len(trials), -1) for metric in metrics}
 
-    def rerun(self, study: Config | JsonObject, *names: str) -> pd.DataFrame:
-        """Run a study beside the stages, with the fastest backend. It overwrites earlier runs in the same place.
+    def repeat_runs(self, tables: JsonObject, rows: pd.DataFrame, *names: str) -> pd.DataFrame:
+        """Repeat runs beside the stages, with the fastest backend. They overwrite earlier ones in the same place.
 
         Nobody knows beforehand how many of these there are: the progress counts the runs of each.
+
+        Args:
+            tables: of the study.
+            rows: values by path, and `seed` where the study has several, a row for each run.
+            *names: of the study, in the folder.
+
+        Returns:
+            The rows with their metrics.
         """
         announce(f"repeating runs ({', '.join(names)})")
-        place = self.path_of(*names)
-        return sweep(study, place, progress=self.progress, devices=self.devices, overwrite=True).frame
+        points = rows.drop(columns="seed", errors="ignore").drop_duplicates()
+        study = tables | {"axes": list_axes({"runs": points.to_dict("list")})}
+        frame = sweep(study, self.path_of(*names), progress=self.progress, devices=self.devices, overwrite=True).frame
+        runs = rows.merge(frame)
+        assert len(runs) == len(rows), "a run was not repeated"
+        return runs

@@ -25,7 +25,7 @@ from .certificate import certify_best_gains, choose_certified_gains
 from .gain_search import GainSearch
 from .loop_gains import LoopTuning, tune_loop
 from .observer_choice import ObserverChoice, choose_observer
-from .pilot import Scenarios, list_scenarios, run_pilot
+from .pilot import list_scenarios, run_pilot
 from .stages import GainChoice, Stages, open_stages
 from .tune_summary import Summary
 
@@ -93,19 +93,17 @@ def tune(
             f"makes another motion; choose {', '.join(LOOP_OBJECTIVES)}, by which the loop is tuned as a whole"
         )
     config = config.model_copy(update={"tune": table})
-    scenarios = None if table.observers or in_loop else list_scenarios(config, table.worst_over_uncertainty)
     with open_stages(
         config, "tune", out, scheduler, progress=progress, devices=devices, overwrite=overwrite, backend=backend
     ) as stages:
         if in_loop:
             return tune_loop(stages)
-        if scenarios is None:
-            return choose_observer(stages)
-        return _search_gains(scenarios, stages)
+        return choose_observer(stages) if table.observers else _search_gains(stages)
 
 
-def _search_gains(scenarios: Scenarios, stages: Stages) -> Tuning:
+def _search_gains(stages: Stages) -> Tuning:
     pilot_before, table = stages.manifest.get("pilot"), stages.table
+    scenarios = list_scenarios(stages.config, table.worst_over_uncertainty)
     search = GainSearch(scenarios, pilot_before or run_pilot(scenarios, table.holdout), stages)
     if pilot_before is None:
         stages.write_manifest(pilot=search.pilot)

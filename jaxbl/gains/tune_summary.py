@@ -103,8 +103,8 @@ class Summary:
         rows, factors = dict(self.held_out[side]), {}
         tuned = rows.pop("tuned")
         for name, row in rows.items():
-            if row["converged"] < 1.0 or tuned["converged"] < 1.0:
-                laggard, share = min((name, row["converged"]), ("tuned", tuned["converged"]), key=lambda pair: pair[1])
+            laggard, share = min((name, row["converged"]), ("tuned", tuned["converged"]), key=lambda pair: pair[1])
+            if share < 1.0:
                 factors[name] = {"why_none": f"{laggard}: converged in {100.0 * share:.3g} % of the runs"}
                 continue
             factors[name] = {

@@ -26,19 +26,17 @@ from jaxbl.sweeps.points import Points
 from jaxbl.sweeps.programs import Backend
 from jaxbl.workers import Progress
 
-from .below_bound import summarise_converged_below
 from .counterexamples import add_causes, run_columns
 from .error_system import (
     SWITCHING_LIMIT,
     ErrorSystemMap,
-    count_judgements,
-    demanded_lambda,
+    judge_conditions,
     judge_error_system,
     simulate_error_system,
     summarise_ratios,
 )
 from .loop_gains import GAIN_SECTIONS, LoopRuns
-from .marks import judge_marks
+from .own_disturbance import judge_marks, summarise_converged_below
 from .pilot import Scenarios
 from .stages import Stages, open_stages
 
@@ -223,9 +221,8 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
     summaries: dict[str, list[JsonObject]] = {bound: [] for bound in bounds}
     counterexamples = []
     for bound, column in bounds.items():
-        for name, demanded in demanded_lambda(config, alpha, frame[column].to_numpy(float)).items():
-            holds = lambda_ > demanded
-            judgement = count_judgements(config, name, holds, converged)
+        judgements = judge_conditions(config.verify.q, lambda_, alpha, frame[column].to_numpy(float), converged)
+        for judgement, holds, demanded in judgements:
             if bound == "true":
                 with np.errstate(divide="ignore"):
                     ratios = demanded[least] / lambda_[least]
@@ -235,7 +232,7 @@ def _judge_level(config: Config, level: str, side: str, frame: pd.DataFrame) -> 
                 judgement["conservatism"] = summarise_ratios(ratios[demands_more], int(at_least.sum()))
             summaries[bound].append(judgement)
             rows = np.flatnonzero(holds & ~converged)
-            extra = {"level": level, "side": side, "condition": name, "bound": bound}
+            extra = {"level": level, "side": side, "condition": judgement["name"], "bound": bound}
             counterexamples.append(frame.iloc[rows].assign(row=rows, **extra))
     converged_runs = frame[converged]
     true_bound, claimed_bound = (converged_runs[column] for column in bounds.values())

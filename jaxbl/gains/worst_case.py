@@ -163,13 +163,13 @@ def least_lambda_simulated(
     It is found by bisection on :func:`half_cycle` to 1.5e-8 of sqrt(alpha + f). It is 0 if damping alone is enough, and
     `inf` if no lambda up to 4 sqrt(alpha + f) is.
     """
-    arguments = jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in (alpha, f_plus, damping, speed)))
-    alpha, f_plus, damping, speed = arguments
+    numbers = (jnp.asarray(number, float) for number in (alpha, f_plus, damping, speed))
+    alpha, f_plus, damping, speed = jnp.broadcast_arrays(*numbers)
     high = 4.0 * jnp.sqrt(alpha + f_plus)
 
     def shrinks(lambda_: Values) -> Values:
         return half_cycle(lambda_, alpha, f_plus, damping=damping, speed=speed).ratio < 1.0
 
     low, least_lambda = bisect(shrinks, high, _HALVINGS)
-    least_lambda = jnp.where(low == 0.0, jnp.where(shrinks(jnp.zeros_like(least_lambda)), 0.0, least_lambda), least_lambda)
+    least_lambda = jnp.where((low == 0.0) & shrinks(jnp.zeros_like(high)), 0.0, least_lambda)
     return jnp.where(shrinks(high), least_lambda, jnp.inf)

@@ -32,7 +32,7 @@ def draw(verdict: Verdict) -> list[Figure]:
     alphas = plane.alpha
     ranges = {"α / f⁺": alphas, "λ / √f⁺": plane.lambda_}
     edges = [cell_edges(values, True) for values in ranges.values()]
-    curves = condition_curves(list_conditions(verdict.config), 1.0, (alphas[0], alphas[-1]))
+    curves = condition_curves(list_conditions(verdict.config.verify.q), 1.0, (alphas[0], alphas[-1]))
     step = max(len(alphas) // 24, 1)
     boundary = Line(alphas[::step], plane.boundary[::step], "simulated boundary", width=0.0, marker="o", fill="#FFFFFF")
     places = [

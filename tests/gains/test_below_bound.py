@@ -5,7 +5,7 @@ import pytest
 from small_study import ALPHA, LAMBDA, listed_axis, rigid_study
 
 from jaxbl.config import read_config, with_values
-from jaxbl.gains.below_bound import read_disturbance, summarise_converged_below
+from jaxbl.gains.own_disturbance import read_disturbance, summarise_converged_below
 from jaxbl.sweeps.sweep import sweep
 from jaxbl.sweeps.trial import run
 

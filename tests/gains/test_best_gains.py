@@ -16,7 +16,8 @@ EVERYWHERE = np.ones(len(GRID), bool)
 
 
 def find(error, works=EVERYWHERE, **options):
-    return find_best_gains(GRID, np.asarray(error, float), works, alpha_ratio=GRID["alpha"].to_numpy(), **options)
+    options = {"allowed": works, "scatter": np.zeros(len(GRID)), "alpha_ratio": GRID["alpha"].to_numpy()} | options
+    return find_best_gains(GRID, np.asarray(error, float), works, **options)
 
 
 def test_equal_errors_are_not_told_apart_by_rounding():

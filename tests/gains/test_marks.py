@@ -5,7 +5,7 @@ import pytest
 from small_study import rigid_study
 
 from jaxbl.config import read_config
-from jaxbl.gains.marks import judge_marks
+from jaxbl.gains.own_disturbance import judge_marks
 from jaxbl.gains.stages import Stages
 from jaxbl.sweeps.trial import run
 

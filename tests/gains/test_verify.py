@@ -14,7 +14,7 @@ from small_study import ALPHA, LAMBDA, listed_axis, rigid_study
 from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.gains import error_system as module
-from jaxbl.gains.counterexamples import repeat_runs
+from jaxbl.gains.counterexamples import repeat_with_change
 from jaxbl.gains.stages import Stages
 from jaxbl.gains.verify import verify
 from jaxbl.sweeps.engine import Engine
@@ -371,7 +371,7 @@ def test_runs_repeated_for_their_cause_keep_their_noise():
     study = read_config(rigid_study(axes=GAINS, sweep={"seeds": 2, "first_seed": 5}))
     frame = sweep(study).frame
     change, stages = {"run.substeps": 2}, Stages(study, "verify")
-    rows = repeat_runs(study.to_dict(), study.axis_paths, frame.iloc[[1, 5]], change, stages, "again")
+    rows = repeat_with_change(study.to_dict(), study.axis_paths, frame.iloc[[1, 5]], change, stages, "again")
     keys = [LAMBDA, ALPHA, "seed"]
     pd.testing.assert_frame_equal(rows[keys].reset_index(drop=True), frame.iloc[[1, 5]][keys].reset_index(drop=True))
     assert set(rows["seed"]) <= {5, 6}
