@@ -18,7 +18,7 @@ from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.explorer.folder import Source, write_static
-from jaxbl.report.explorer.server import start_server
+from jaxbl.report.explorer.server import ExplorerServer
 from jaxbl.report.explorer.study import nearby, simulated, study_source, write_study
 from jaxbl.report.maps import best_gains, worst_runs
 from jaxbl.sweeps.sweep import open_study, share, sweep
@@ -424,7 +424,7 @@ CLICKS = """async () => {
 
 @needs_chromium
 def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folder, tmp_path):
-    with start_server(study_source(swept_folder)) as server:
+    with ExplorerServer(study_source(swept_folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with open_pages(server.url) as (page,):
             page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
@@ -502,7 +502,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folde
 
 def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path):
     share(SWEEP_STUDY, tmp_path / "out", (1, 2))
-    with start_server(study_source(tmp_path / "out")) as server:
+    with ExplorerServer(study_source(tmp_path / "out")) as server:
 
         def read_version(version):
             file = server.file(version, "data.js")
