@@ -23,7 +23,7 @@ from small_study import ALPHA, LAMBDA, NOISE, make_result, rigid_study, spaced_a
 
 from jaxbl.config import read_config, with_values  # noqa: E402
 from jaxbl.report.explorer.folder import Source, write_static  # noqa: E402
-from jaxbl.report.explorer.server import start_server  # noqa: E402
+from jaxbl.report.explorer.server import ExplorerServer  # noqa: E402
 from jaxbl.report.explorer.study import study_source, write_study  # noqa: E402
 from jaxbl.sweeps.sweep import open_study, sweep  # noqa: E402
 from jaxbl.sweeps.trial import run, run_perturbed  # noqa: E402
@@ -65,7 +65,7 @@ def large(place: Path) -> None:
     began = time.perf_counter()
     index = write_static(source, place / "page")
     print(f"{len(result.frame):.0e} points written in {time.perf_counter() - began:.1f} s")
-    with start_server(source) as server:
+    with ExplorerServer(source) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         server.newest()
         for name, url in (("disk", index.as_uri()), ("server", server.url)):
@@ -131,7 +131,7 @@ if __name__ == "__main__":
         further_runs()
         sweep(MAP, place / "map")
         rounding(place / "map")
-        with start_server(study_source(place / "map")) as server, sync_playwright() as playwright:
+        with ExplorerServer(study_source(place / "map")) as server, sync_playwright() as playwright:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 1200, "height": 900})

@@ -10,7 +10,7 @@ from pathlib import Path
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from jaxbl.report.explorer.folder import Source
-from jaxbl.report.explorer.server import start_server
+from jaxbl.report.explorer.server import ExplorerServer
 from jaxbl.report.explorer.sources import open_source
 
 FIGURES = Path(__file__).parent / "figures"
@@ -42,7 +42,7 @@ def log(page: Page) -> None:
 
 def draw(source: Source, picture: Callable[[Page], None]) -> None:
     """Serve a page, and have its picture taken."""
-    with start_server(source) as server, sync_playwright() as playwright:
+    with ExplorerServer(source) as server, sync_playwright() as playwright:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         picture(opened(browser, server.url))

@@ -364,9 +364,9 @@ def explore(
         with run_with_progress(context, static, static, unit=STEPS, first="writing the page"):
             page = write_static(source, static)
         return Outcome([*source.lead], static, page.name)
-    from jaxbl.report.explorer.server import start_server
+    from jaxbl.report.explorer.server import ExplorerServer
 
-    with start_server(source, port) as server:
+    with ExplorerServer(source, port) as server:
         # the address is what was asked for
         for line in (*([] if is_quiet(context) else source.lead), f"Open {server.url}", "Ctrl+C ends it."):
             typer.echo(escape_unprintable(line), err=True)

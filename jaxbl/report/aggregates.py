@@ -87,13 +87,6 @@ class Groups:
             return np.zeros(len(frame), np.int64)
         return self.index.get_indexer(frame.set_index(self._keys).index)
 
-    def _numbers(self, column: Column) -> Iterator[tuple[Array, Array]]:
-        """Groups and numbers of the rows that have one, part by part."""
-        for frame in self._rows:
-            values = np.asarray(column(frame), float)
-            there = ~np.isnan(values)
-            yield self.of(frame)[there], values[there]
-
     def means(self, columns: dict[str, Column]) -> DataFrame:
         """Means of numbers by group, NaN left out, and the number of rows in `rows`."""
         columns = columns | {"rows": lambda frame: np.ones(len(frame))}
@@ -112,9 +105,12 @@ class Groups:
         They are sorted in a temporary file of 16 bytes a number."""
         count = np.zeros(len(self), np.int64)
         with TemporaryFile() as file:
-            for groups, values in self._numbers(column):
+            for frame in self._rows:
+                values = np.asarray(column(frame), float)
+                there = ~np.isnan(values)
+                groups = self.of(frame)[there]
                 count += np.bincount(groups, minlength=len(self))
-                np.column_stack([groups, values]).tofile(file)
+                np.column_stack([groups, values[there]]).tofile(file)
             np.full(2, np.nan).tofile(file)
             # complex numbers are sorted by their real parts, the groups, and then by the others; nan is behind all
             pairs = np.memmap(file, complex, "r+")

@@ -7,7 +7,7 @@
 import re
 from collections.abc import Iterable
 from functools import lru_cache, partial
-from itertools import cycle, groupby
+from itertools import cycle, groupby, repeat
 from operator import itemgetter
 from typing import Any
 
@@ -81,7 +81,6 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
     names = "finite", "converged", "f_plus", *MARGINS
     metrics = (column for column in result.columns if column == figure.value or column.rpartition(".")[2] in names)
     drawn = [axis for axis in config.axes if axis.path in (figure.x, figure.y)]
-    random = [axis for axis in drawn if axis.values is None and axis.num is None]
     # about four points in each bin of a map
     bins = int(np.clip(np.sqrt(config.sweep.points or 0) / 2.0, 6, 64))
 
@@ -90,9 +89,10 @@ def _rows(result: StudyResult, figure: FigureTable, points: Points) -> Rows:
 
     def select(frame: DataFrame) -> DataFrame:
         frame = filter_rows(frame[points.on_coarse_grid(frame.assign(**starts))], resolve_where(config, figure))
-        for axis in random:
-            halves = axis.model_copy(update={"num": 2 * bins + 1}).grid()
-            frame = frame.assign(**{axis.path: halves[1::2][np.searchsorted(halves[2:-1:2], frame[axis.path])]})
+        for axis in drawn:
+            if axis.values is None and axis.num is None:
+                halves = axis.model_copy(update={"num": 2 * bins + 1}).grid()
+                frame = frame.assign(**{axis.path: halves[1::2][np.searchsorted(halves[2:-1:2], frame[axis.path])]})
         return frame
 
     return Rows(result, [*config.axis_paths, "seed", *metrics], select)
@@ -253,7 +253,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
         filled = [filling.complete(part, unseen) for _, part in _split(rows.frame, spec.facet)]
         groups = Groups(filled, keys, paths)
     table, converged = _map_table(groups, metric), f"{side}.converged"
-    bounds = _bounds(filled, spec, points).to_numpy() if spec.overlays else None
+    bounds = _bounds(filled, spec, points) if spec.overlays else repeat(None)
     errors, judged = {}, re.search(r"rmse|chatter|convergence_time$", metric) and converged in table
     if config.sweep.design == "grid" and judged and all(path.startswith(f"observer.{side}.") for path in axes):
         # of a refined study those that were simulated
@@ -267,7 +267,7 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
     if len(failures):
         word = "not converged" if converged in failures or "time" in metric else "undefined"
         failure = f"{'diverged' if (failures['finite'] < 1.0).all() else word} ({len(failures)} points)"
-    for i, (value, part) in enumerate(_split(table, spec.facet)):
+    for (value, part), bound in zip(_split(table, spec.facet), bounds, strict=False):
         plane = part[["value", "failed"]].astype(float)
         # what an unfinished study has not computed yet stays white
         plane = plane if filling is None else filling.fill(plane).fillna({"failed": 1.0})
@@ -280,8 +280,8 @@ def _heatmap(config: Config, rows: Rows, spec: FigureTable, points: Points) -> t
             place = errors[value].index[best.index]
             parts += [mark(*place[::-1], "best", size=13.0)]
             under.append(f"best ★ {part['value'][place]:.2g} {find_metric(metric).unit}".rstrip())
-        if bounds is not None:
-            bound, alpha_is_x = bounds[i], spec.x.endswith(".alpha")
+        if bound is not None:
+            alpha_is_x = spec.x.endswith(".alpha")
             alphas = (x if alpha_is_x else y).ends
             parts += condition_curves({key: CONDITIONS[key] for key in spec.overlays}, bound, alphas, alpha_is_x)
             under.append(f"f⁺ = {bound:.3g} rad/s²")
@@ -399,7 +399,7 @@ def best_gains(runs: DataFrame) -> BestGains | None:
         runs.index.to_frame(index=False).rename(columns=lambda path: path.rpartition(".")[2]),
         runs["error"].to_numpy(),
         works,
-        allowed=works & (margins.get("margin_exact", np.inf) > 1.0),
+        allowed=margins.get("margin_exact", np.inf) > 1.0,
         alpha_ratio=margins.get("margin_alpha"),
         scatter=runs["scatter"].to_numpy(),
     )

@@ -24,10 +24,15 @@ const found = (panel, at, size) => {
 
 const DASHES = { "--": [6, 4], ":": [2, 3], "-.": [8, 4, 2, 4] };
 const black = (colour) => (colour === "#000000" ? undefined : colour);
-const unpack = ({ x, y, lines, cells, bands, spans, ...panel }) => ({
-  ...panel, ...Object.fromEntries([["x", x], ["y", y]].map(([name, { names, ...axis }]) => [name, { ...axis, names: names && new Map(names) }])),
-  lines: lines.map((line) => ({ ...line, x: unpacked(line.x), y: unpacked(line.y), colour: black(line.colour), alpha: line.opacity, dash: DASHES[line.dashes] })),
-  cells: cells && { name: cells.name, edges: [unpacked(cells.x), unpacked(cells.y)], values: unpacked(cells.values) },
+const joined = (words, by) => words.replaceAll("\n", by);
+const unpackAxis = ({ label, names, ...axis }) => ({ ...axis, label: joined(label, " "), names: names.length ? new Map(names.map(([place, name]) => [place, joined(name, ", ")])) : undefined });
+const unpackLine = (line) => {
+  const x = unpacked(line.x), sorted = x.every((one, i) => !i || one >= x[i - 1]);
+  return { ...line, x, y: unpacked(line.y), sorted, colour: black(line.colour), alpha: line.opacity, dash: DASHES[line.dashes] };
+};
+const unpack = ({ title, x, y, lines, cells, bands, spans, ...panel }) => ({
+  ...panel, title: joined(title, ", "), x: unpackAxis(x), y: unpackAxis(y), lines: lines.map(unpackLine),
+  cells: cells && { name: joined(cells.label, " "), edges: [unpacked(cells.x), unpacked(cells.y)], values: unpacked(cells.values) },
   shades: [...bands.map((band) => ({ ...band, x: unpacked(band.x), low: unpacked(band.low), high: unpacked(band.high) })), ...spans.map((span) => ({ ...span, colour: black(span.colour) ?? GREY }))].map((one) => ({ ...one, alpha: one.low === one.high ? 1 : one.opacity })),
 });
 

@@ -249,28 +249,28 @@ def thin(part: Part) -> Part:
     a cloud every n-th."""
     if isinstance(part, Band):
         x, low, high = map(np.asarray, part[:3])
-        least, largest = envelope(low, high)
+        least, largest = _list_extremes(low, high)
         return part._replace(x=x[least], low=low[least], high=high[largest])
     if not isinstance(part, Line) or len(part.x) <= _LINE_POINTS:
         return part
     x, y = np.asarray(part.x, float), np.asarray(part.y, float)
     if part.width and part.is_sorted:
-        rows = np.sort(np.concatenate(envelope(y, y)))
+        rows = np.sort(np.concatenate(_list_extremes(y, y)))
     else:
-        count = _CLOUD_POINTS if part.width == 0.0 else 2 * _CLOUD_POINTS
+        count = _CLOUD_POINTS * (2 if part.width else 1)
         rows = np.unique(np.linspace(0, len(x) - 1, min(count, len(x))).astype(int))
     return part._replace(x=x[rows], y=y[rows])
 
 
-def envelope(low: Any, high: Any) -> list[Array]:
+def _list_extremes(low: Array, high: Array) -> list[Array]:
     """Indices of the least of one signal, and of the largest of another, in each bin of the points of a line."""
     size = -(-len(low) // (_LINE_POINTS // 2))
     rows = []
-    for values, find, filler in ((low, np.argmin, np.inf), (high, np.argmax, -np.inf)):
+    for values in (low, -high):
         # the first of a bin that is a break, so that it stays one
-        there = np.where(np.isnan(values), filler, values)
-        bins = np.pad(there, (0, -len(values) % size), constant_values=filler).reshape(-1, size)
-        rows.append(np.arange(len(bins)) * size + find(bins, axis=1))
+        there = np.where(np.isnan(values), np.inf, values)
+        bins = np.pad(there, (0, -len(values) % size), constant_values=np.inf).reshape(-1, size)
+        rows.append(np.arange(len(bins)) * size + bins.argmin(axis=1))
     return rows
 
 
@@ -353,25 +353,19 @@ def panel_json(panel: Panel, place: Sequence[float], ends: Sequence[Pair]) -> Js
         place: left, top, width and height, as shares of the figure.
         ends: of x and y, as they are drawn.
     """
-    content: JsonObject = {"place": [round(number, 5) for number in place], "title": panel.title.replace("\n", ", ")}
+    content: JsonObject = {"place": [round(number, 5) for number in place], "title": panel.title}
     for (name, axis), drawn_ends in zip(panel.axes.items(), ends, strict=True):
-        content[name] = {
-            "label": axis.label.replace("\n", " "), "key": axis.key, "log": axis.log,
-            "ends": [float(f"{end:.8g}") for end in drawn_ends],
-        }  # fmt: skip
-        if axis.names:
-            content[name]["names"] = [[place, text.replace("\n", ", ")] for place, text in axis.names]
+        content[name] = axis._asdict() | {"ends": [float(f"{end:.8g}") for end in drawn_ends]}
     content |= {kind: [] for kind in ("lines", "bands", "spans")}
     for part in map(thin, panel.parts):
         if isinstance(part, Line | Band | Span):
-            fields = part._asdict() | {"sorted": isinstance(part, Line) and part.is_sorted}
-            curves = set() if isinstance(part, Span) else {"x", "y", "low", "high"}
-            fields |= {key: pack_numbers(fields[key]) for key in fields.keys() & curves}
+            fields = part._asdict()
+            if not isinstance(part, Span):
+                fields |= {key: pack_numbers(fields[key]) for key in fields.keys() & {"x", "y", "low", "high"}}
             content[f"{type(part).__name__.lower()}s"].append(fields)
         elif isinstance(part, Map) and np.size(part.values) <= _MOST_CELLS:
-            cells = {key: pack_numbers(np.ravel(getattr(part, key))) for key in ("x", "y", "values")}
-            scale = part.scale._asdict()
-            content["cells"] = cells | {"name": scale.pop("label").replace("\n", " ")} | scale
+            cells = {key: pack_numbers(getattr(part, key)) for key in ("x", "y", "values")}
+            content["cells"] = part.scale._asdict() | cells
     return to_jsonable(content)
 
 

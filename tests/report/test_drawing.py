@@ -29,7 +29,7 @@ def test_lines_names_and_a_description(tmp_path):
     assert (tmp_path / "a" / "one.png").stat().st_size > 5000
     left, right = shown.panels
     (drawn,) = left["lines"]
-    assert drawn["name"] == "price in $" and drawn["sorted"]
+    assert drawn["name"] == "price in $"
     np.testing.assert_array_equal(unpack(drawn["x"]), x)
     y = unpack(drawn["y"])
     assert y[0] == 1.0 and np.isnan(y[1]) and y[2] == np.finfo(np.float32).max
@@ -61,7 +61,7 @@ def test_a_failed_region_is_one_grey_with_one_entry_and_colours_are_for_the_rest
     assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["failed (2 points)"]
     assert canvas.axes[-1].get_ylabel() == "error (rad)"
     (panel,) = picture(figure).panels
-    assert (panel["cells"]["name"], panel["cells"]["log"]) == ("error (rad)", True)
+    assert (panel["cells"]["label"], panel["cells"]["log"]) == ("error (rad)", True)
     np.testing.assert_array_equal(unpack(panel["cells"]["values"]), np.float32(values.ravel()))
 
 

@@ -217,13 +217,12 @@ def signal_panel(top, label, slope):
         "colour": "#000000",
         "x": pack_numbers(time),
         "y": pack_numbers(values),
-        "sorted": True,
         "width": 1.5,
         "dashes": "--",
         "marker": "",
         "opacity": 1.0,
     }
-    axis = {"log": False, "key": ""}
+    axis = {"log": False, "key": "", "names": []}
     return {
         "place": [0.1, top, 0.8, 0.35],
         "title": "",

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from matplotlib import colormaps
@@ -20,9 +19,8 @@ from matplotlib.colors import to_hex
 
 from jaxbl.files import Subject, open_results
 from jaxbl.json_types import JsonObject
-from jaxbl.report.maps import drawn_values
 
-ROW_GROUP = 1 << 17
+_ROW_GROUP = 1 << 17
 """Rows of a row group of the Parquet file."""
 _SCRIPT = 4 << 20
 """Bytes of the Parquet file in a script."""
@@ -31,7 +29,7 @@ _FILES = (
     "vendored/hyparquet.LICENSE.txt", "vendored/uPlot.LICENSE.txt", "vendored/uPlot.css", "page.css",
     "explorer/page/explore.css",
 )  # fmt: skip
-"""Of every page; scripts in the order in which they are loaded."""
+"""Of every page."""
 
 
 def write_points(out: Path, types: Mapping[str, type], parts: Iterable[Any]) -> int:
@@ -39,8 +37,8 @@ def write_points(out: Path, types: Mapping[str, type], parts: Iterable[Any]) -> 
     schema, rows = pa.schema([(name, pa.from_numpy_dtype(dtype)) for name, dtype in types.items()]), 0
     with pq.ParquetWriter(out / "points.parquet", schema, use_dictionary=False) as writer:
         for part in parts:
-            table = pa.table({name: np.asarray(part[name], float).astype(dtype) for name, dtype in types.items()}, schema)
-            writer.write_table(table, row_group_size=ROW_GROUP)
+            table = pa.table({name: np.asarray(part[name], dtype) for name, dtype in types.items()}, schema)
+            writer.write_table(table, row_group_size=_ROW_GROUP)
             rows += len(table)
     return rows
 
@@ -87,42 +85,34 @@ def write_static(source: Source, out: Path) -> Path:
     return out / "index.html"
 
 
-def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, scripts: bool = True) -> None:
+def write_page(out: Path, parts: Sequence[str], content: JsonObject, *, served: bool = False) -> None:
     """Write a page into a folder that has `points.parquet`.
 
     Args:
         out: the folder.
-        parts: of the page, by name: each has a script in `page/`, and the first one elements.
+        parts: of the page, by name: each has a script in `page/`; the elements of the first one load all of them.
         content: what it says, as plain data.
-        scripts: whether it can be opened from disk.
+        served: whether a server is to give the data; else it can be opened from disk.
     """
     points = out / "points.parquet"
-    data = json.dumps(content | {"bytes": points.stat().st_size, "script": _SCRIPT})
+    data = json.dumps(content | {"served": served, "bytes": points.stat().st_size, "script": _SCRIPT})
     (out / "data.js").write_text(f"jaxblData({data});\n", encoding="utf-8")
-    if scripts:
+    if not served:
         with points.open("rb") as file:
             for number, chunk in enumerate(iter(lambda: file.read(_SCRIPT), b"")):
                 text = f'jaxblBytes({number}, "{base64.b64encode(chunk).decode()}");\n'
                 (out / f"points.{number:04d}.js").write_text(text, encoding="ascii")
     report = files("jaxbl.report")
-    originals = [report.joinpath(name) for name in [*_FILES, *(f"explorer/page/{part}.js" for part in parts)]]
-    for original in originals:
+    for name in [*_FILES, *(f"explorer/page/{part}.js" for part in parts)]:
+        original = report.joinpath(name)
         (out / original.name).write_bytes(original.read_bytes())
     page, elements = (report.joinpath(f"explorer/page/{name}.html").read_text("utf-8") for name in ("page", parts[0]))
-    names = [*(original.name for original in originals), "data.js"]
-    loaded = "\n".join(f'<script src="{name}"></script>' for name in names if name.endswith(".js"))
-    page = page.replace("{parts}", elements).replace("{scripts}", loaded)
-    (out / "index.html").write_text(page, encoding="utf-8")
+    (out / "index.html").write_text(page.replace("{parts}", elements), encoding="utf-8")
 
 
 def colours_of(name: str) -> list[str]:
     """A colour map as pages have it."""
     return [to_hex(colour) for colour in colormaps[name](np.linspace(0.0, 1.0, 256))]
-
-
-def page_values(frame: pd.DataFrame, name: str) -> np.ndarray:
-    """A metric as pages draw it: as :func:`drawn_values`."""
-    return drawable(drawn_values(frame, name))
 
 
 def drawable(values: Any) -> np.ndarray:

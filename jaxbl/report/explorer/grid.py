@@ -4,7 +4,6 @@ Rows of `points.parquet` are in the order of the axes, which need not be stored 
 """
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -17,12 +16,12 @@ from jaxbl.json_types import JsonObject
 from jaxbl.observer.conditions import CONDITIONS
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.gain_plane import least_lambdas
-from jaxbl.report.maps import MARGINS, axis_words, best_gains, worst_runs
+from jaxbl.report.maps import MARGINS, axis_words, best_gains, drawn_values, worst_runs
 from jaxbl.report.panels import Array, pack_numbers
 from jaxbl.sweeps.points import AxisColumns, Points
 from jaxbl.sweeps.sweep import StudyResult
 
-from .folder import ROW_GROUP, page_values, write_points
+from .folder import drawable, write_points
 
 _OVERVIEW = 512
 """Cells of the overview along each axis, at most."""
@@ -33,8 +32,7 @@ def dimensions(config: Config) -> list[AxisColumns] | None:
     axes that vary, refined, or a quasi-random design."""
     if config.sweep.refine is not None or config.sweep.design != "grid":
         return None
-    first = config.sweep.first_seed
-    dims = [*Points(config).dimensions, {"seed": np.arange(first, first + config.sweep.seeds)}]
+    dims = [*Points(config).dimensions, {"seed": config.sweep.first_seed + np.arange(config.sweep.seeds)}]
     return dims if sum(_length(dim) > 1 for dim in dims[:-1]) >= 2 else None
 
 
@@ -73,9 +71,8 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path, d
             places = np.ravel_multi_index([_places(dim, frame) for dim in dims], shape)
             runs += len(frame)
             for name, values in columns.items():
-                values[places] = page_values(frame, name)
-        parts = np.split(numbers, range(ROW_GROUP, rows, ROW_GROUP), axis=1)
-        write_points(out, dict.fromkeys(metrics, np.float32), (dict(zip(metrics, part, strict=True)) for part in parts))
+                values[places] = drawable(drawn_values(frame, name))
+        write_points(out, dict.fromkeys(metrics, np.float32), [columns])
         x, y = _first_axes(result.config, dims)
         cells = {name: np.moveaxis(values.reshape(shape), (y, x), (-2, -1)) for name, values in columns.items()}
         telling = _most_telling(cells, first)
@@ -87,7 +84,7 @@ def write_grid(result: StudyResult, metrics: list[str], first: str, out: Path, d
             "found": runs,
             "total": rows,
             "start": {"x": x, "y": y, "at": _place_in_all(telling, x, y).tolist()},
-            "overview": _overview(cells[first][telling[:-1]]),
+            "overview": _overview(cells[first][telling]),
             "stars": _stars(cells, first, dims, x, y, telling),
         }
 
@@ -109,7 +106,7 @@ _MOST_JUDGED = 4096
 
 
 def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
-    """The slice (places along the other dimensions, the seed the last) with the clearest border between what works and what
+    """The slice (places along the other dimensions, without the seed) with the clearest border between what works and what
     fails; where none has a border, that with the largest spread of the metric."""
     metric = cells[first]
     values = cells.get(f"{first.partition('.')[0]}.converged", metric)
@@ -123,7 +120,7 @@ def _most_telling(cells: dict[str, Array], first: str) -> tuple[int, ...]:
         # tenths: of slices with about the same border that with the larger spread
         return round(10.0 * min(share, 1.0 - share)), spread
 
-    return *max(np.ndindex(*values.shape[:-3]), key=rate_slice), 0
+    return max(np.ndindex(*values.shape[:-3]), key=rate_slice)
 
 
 _MOST_STARRED = 1 << 16
@@ -132,8 +129,9 @@ _MOST_STARRED = 1 << 16
 
 def _stars(
     cells: dict[str, Array], first: str, dims: list[AxisColumns], x: int, y: int, telling: tuple[int, ...]
-) -> list[JsonObject]:
-    """The best gains of each slice: places along all dimensions; none where the first map is not over gains."""
+) -> list[list[int]]:
+    """The best gains of each slice, the most telling one first: places along all dimensions; none where the first map is not
+    over gains."""
     side = first.partition(".")[0]
     paths, values = zip(*(next(iter(dims[i].items())) for i in (y, x)), strict=True)
     shape = cells[first].shape
@@ -143,22 +141,22 @@ def _stars(
         return []
     runs = pd.MultiIndex.from_product([range(shape[-3]), *values], names=["seed", *paths]).to_frame(index=False)
     stars = []
-    for index in sorted(np.ndindex(*shape[:-3]), key=lambda index: index != telling[:-1])[:64]:
+    for index in sorted(np.ndindex(*shape[:-3]), key=lambda index: index != telling)[:64]:
         frame = runs.assign(**{name: cells[name][index].ravel() for name in needed})
-        if frame[["finite", f"{side}.converged"]].isna().to_numpy().any():
+        if frame[["finite", f"{side}.converged"]].isna().any(axis=None):
             continue
         worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first)
         if (best := best_gains(worst)) is not None:
-            place = _place_in_all([*index, 0], x, y)
+            place = _place_in_all(index, x, y)
             gains_there = zip(values, worst.index[best.index], strict=True)
             place[[y, x]] = [np.flatnonzero(axis == value)[0] for axis, value in gains_there]
-            stars.append({"metric": first, "first": index == telling[:-1], "at": place.tolist()})
+            stars.append(place.tolist())
     return stars
 
 
-def _place_in_all(hidden: Sequence[int], x: int, y: int) -> Array:
-    """The place along all dimensions of one along those that are hidden."""
-    return np.insert(np.array(hidden, int), [min(x, y), max(x, y) - 1], 0)
+def _place_in_all(index: tuple[int, ...], x: int, y: int) -> Array:
+    """The place along all dimensions of the first run of a slice."""
+    return np.insert([*index, 0], [min(x, y), max(x, y) - 1], 0)
 
 
 def _overview(values: Array) -> JsonObject:
@@ -172,9 +170,12 @@ def _overview(values: Array) -> JsonObject:
 def _conditions() -> list[JsonObject]:
     """Each condition as a curve: it is homogeneous, lambda / sqrt(f) over alpha / f."""
     ratios = np.geomspace(1.0005, 2000.0, 600)
-    curves = []
-    for name, condition in CONDITIONS.items():
-        values = ratios, least_lambdas(condition, ratios, 1.0)
-        alpha, lambda_ = ([float(f"{number:.6g}") for number in numbers] for numbers in values)
-        curves.append({"name": name, "title": condition.title, "alpha": alpha, "lambda": lambda_})
-    return curves
+    return [
+        {
+            "name": name,
+            "title": condition.title,
+            "alpha": pack_numbers(ratios),
+            "lambda": pack_numbers(least_lambdas(condition, ratios, 1.0)),
+        }
+        for name, condition in CONDITIONS.items()
+    ]

@@ -33,7 +33,7 @@ def log_source(file: Path, title: str, sentences: Sequence[str]) -> Source:
         frame = pd.read_csv(points) if points.suffix == ".csv" else pd.read_parquet(points)
         content = write_log(summary, frame, out)
         content |= {"title": title, "lead": sentences, "config": text, "file": model}
-        write_page(out, ("log",), content, scripts=not served)
+        write_page(out, ("log",), content, served=served)
         return False
 
     return Source(str(summary.get("identity") or checksum(file.read_bytes())), sentences, write)
@@ -65,8 +65,8 @@ def write_log(summary: JsonObject, trace: DataFrame, out: Path) -> JsonObject:
         raise InputError(
             "explore: trace.parquet has no column that the page could draw; run the command that wrote it again"
         )
-    lines = [*coordinates, *(line for group in groups for line in group["lines"])]
-    drawn = {"held_out", *(line["column"] for line in lines)}
+    drawn = {line["column"] for lines in (coordinates, *(group["lines"] for group in groups)) for line in lines}
+    drawn.add("held_out")
     # float32 would round times; what is not there stays nan, which a page reads as a number
     write_points(out, {name: np.float64 if name == "t" else np.float32 for name in frame if name in drawn}, [frame])
     return {
@@ -100,9 +100,10 @@ def _watch_groups(summary: JsonObject) -> Iterable[_Group]:
 
 def _units(summary: JsonObject) -> dict[str, str]:
     """Unit of each side's position: m on a linear axis."""
-    if "gap" in summary:
-        return {side: summary["gap"]["units"].get(name, "rad") for side, name in POSITION_CHANNELS.items()}
-    return {side: summary.get("residual", {}).get(side, {}).get("unit", "rad") for side in POSITION_CHANNELS}
+    channels, residual = summary.get("gap", {}).get("units", {}), summary.get("residual", {})
+    return {
+        side: channels.get(name) or residual.get(side, {}).get("unit", "rad") for side, name in POSITION_CHANNELS.items()
+    }
 
 
 def _force(unit: str) -> str:

@@ -6,13 +6,15 @@ import secrets
 import shutil
 import sys
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+
+import numpy as np
 
 from jaxbl.errors import InputError, NoResult
 
@@ -32,61 +34,48 @@ _POLICY = (
 )
 
 
-@contextmanager
-def start_server(source: Source, port: int = 0) -> "Iterator[ExplorerServer]":
-    """A server for results, which waits for `serve_forever`; its pages are removed at the end.
+class ExplorerServer(ThreadingHTTPServer):
+    """Serves a page, and answers its questions, once `serve_forever` is called; `url` is what the browser opens.
+
+    It is closed by `with`, which removes its pages.
+
+    Args:
+        source: results; the page is written again when it is loaded again, if there is more to come.
+        port: to be bound; 0 for any that is free.
 
     Raises:
         InputError: the port is another program's.
     """
-    with TemporaryDirectory(prefix="jaxbl-explore-") as place:
-        try:
-            server = ExplorerServer(source, Path(place), port)
-        except OSError as error:
-            raise InputError(f"--port {port}: {error.strerror}; choose another one") from None
-        with server:
-            threading.Thread(target=_prepare, args=(source,), name="jaxbl-prepare", daemon=True).start()
-            try:
-                yield server
-            finally:
-                # threads of XLA that still compute would take the interpreter down
-                source.finish()
-
-
-def _prepare(source: Source) -> None:
-    # what is wrong, the first answer says
-    with suppress(ValueError, RuntimeError, MemoryError, NoResult):
-        source.prepare()
-
-
-class ExplorerServer(ThreadingHTTPServer):
-    """Serves a page and answers its questions; `url` is what the browser opens.
-
-    Args:
-        source: results; the page is written again when it is loaded again, if there is more to come.
-        place: a folder for pages, which the caller removes.
-        port: to be bound; 0 for any that is free.
-
-    Raises:
-        OSError: the port cannot be bound.
-    """
 
     daemon_threads = True
 
-    def __init__(self, source: Source, place: Path, port: int):
-        self.source, self._place = source, place
+    def __init__(self, source: Source, port: int = 0):
+        self.source, self._folder = source, TemporaryDirectory(prefix="jaxbl-explore-")
+        self._place = Path(self._folder.name)
         self.token = secrets.token_urlsafe(24)
         self._lock, self._stale = threading.Lock(), True
-        # the number of its versions, and which of these a browser has loaded
-        self._versions, self._loaded = 0, set()
-        super().__init__(("127.0.0.1", port), _Handler)
+        # whether a browser has loaded it, by the number of each version that was written
+        self._loaded: dict[str, bool] = {}
+        try:
+            super().__init__(("127.0.0.1", port), _Handler)
+        except OSError as error:
+            raise InputError(f"--port {port}: {error.strerror}; choose another one") from None
         self.names = {f"{name}:{self.server_port}" for name in ("127.0.0.1", "localhost")}
         self.url = f"http://127.0.0.1:{self.server_port}/{self.token}/"
+        threading.Thread(target=self._prepare, name="jaxbl-prepare", daemon=True).start()
+
+    def _prepare(self) -> None:
+        # what is wrong, the first answer says
+        with suppress(ValueError, RuntimeError, MemoryError, NoResult):
+            self.source.prepare()
 
     def server_close(self) -> None:
+        # threads of XLA that still compute would take the interpreter down
+        self.source.finish()
         super().server_close()
         # a page that is being written is written to the end, and no other one
         self._lock.acquire()
+        self._folder.cleanup()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         # a browser that leaves a page ends what it was reading, and what sends half a request is left
@@ -111,35 +100,32 @@ class ExplorerServer(ThreadingHTTPServer):
         """
         with self._lock:
             if self._stale:
-                folder = self._place / str(self._versions + 1)
+                number = len(self._loaded) + 1
+                folder = self._place / str(number)
                 folder.mkdir()
                 try:
                     self._stale = self.source.write(folder, True)
                 except BaseException:
                     shutil.rmtree(folder)
                     raise
-                self._versions += 1
-                shutil.rmtree(self._place / str(self._versions - _MOST_VERSIONS), ignore_errors=True)
-            return str(self._versions)
+                self._loaded[folder.name] = False
+                shutil.rmtree(self._place / str(number - _MOST_VERSIONS), ignore_errors=True)
+            return str(len(self._loaded))
 
     def is_outdated(self, version: str, name: str) -> bool:
         """True if a page is loaded again while there is, or may be, a newer version of it."""
-        if name != "index.html":
+        if name != "index.html" or version not in self._loaded:
             return False
         with self._lock:
-            again = version in self._loaded
-            self._loaded |= {version} & self._list_versions()
-            return again and (self._stale or version != str(self._versions))
+            again = self._loaded[version]
+            self._loaded[version] = True
+            return again and (self._stale or version != str(len(self._loaded)))
 
     def file(self, version: str, name: str) -> Path | None:
         """A file of a page; None if there is none."""
-        files = (self._place / version).glob("*") if version in self._list_versions() else ()
+        files = (self._place / version).glob("*") if version in self._loaded else ()
         # names are compared, so that none leads elsewhere
         return next((file for file in files if file.name == name and file.is_file()), None)
-
-    def _list_versions(self) -> set[str]:
-        """Numbers of the versions that were written, as text."""
-        return {*map(str, range(1, self._versions + 1))}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -155,27 +141,25 @@ class _Handler(BaseHTTPRequestHandler):
         pass
 
     def do_GET(self) -> None:
-        if (parts := self._parts()) is None:
+        if (asked := self._read_address()) is None:
             return
-        if parts in ([], [""]) or (len(parts) == 2 and self.server.is_outdated(*parts)):
+        if asked == ("", "") or self.server.is_outdated(*asked):
             try:
                 newest = self.server.newest()
             except (InputError, NoResult, OSError) as error:
                 self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
             else:
-                self._send(HTTPStatus.FOUND, headers={"Location": f"{self.server.url}{newest}/index.html"})
-            return
-        file = self.server.file(*parts) if len(parts) == 2 else None
-        if file is None:
-            self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
-        else:
+                self._send(HTTPStatus.FOUND, Location=f"{self.server.url}{newest}/index.html")
+        elif file := self.server.file(*asked):
             self._send_file(file)
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def do_POST(self) -> None:
-        if (parts := self._parts()) is None:
+        if (asked := self._read_address()) is None:
             return
         length = self.headers.get("Content-Length", "")
-        answer = self.server.source.answers.get(parts[-1]) if len(parts) == 2 else None
+        answer = self.server.source.answers.get(asked[1])
         if answer is None or self.headers.get_content_type() != "application/json":
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such question")
         elif not re.fullmatch(r"\d{1,9}", length) or int(length) > _MOST_ASKED:
@@ -189,56 +173,58 @@ class _Handler(BaseHTTPRequestHandler):
                 # of XLA, too
                 self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}")
             else:
-                self._send(HTTPStatus.OK, json.dumps(result, allow_nan=False).encode(), "application/json")
+                self._send_json(HTTPStatus.OK, result)
 
-    def _parts(self) -> list[str] | None:
-        """The address behind the token; None where the request was refused.
+    def _read_address(self) -> tuple[str, str] | None:
+        """Version and name of what is asked for, behind the token; None where the request was refused.
 
         A page of another site may ask for this address, too: it would not have the token, and its browser names it.
         """
-        origin = self.headers.get("Origin")
-        if self.headers.get("Host") not in self.server.names:
+        host = self.headers.get("Host", "")
+        token, _, place = self.path.partition("?")[0].removeprefix("/").partition("/")
+        if host not in self.server.names:
             # a name of another site that was pointed to this machine
-            self._refuse(HTTPStatus.FORBIDDEN, "asked for by another name")
-        elif origin is not None and origin.removeprefix("http://") not in self.server.names:
-            self._refuse(HTTPStatus.FORBIDDEN, "asked for by another site")
+            reason = "asked for by another name"
+        elif self.headers.get("Origin", host).removeprefix("http://") not in self.server.names:
+            reason = "asked for by another site"
+        elif secrets.compare_digest(token.encode(), self.server.token.encode()):
+            version, _, name = place.partition("/")
+            return version, name
         else:
-            token, *parts = self.path.partition("?")[0].removeprefix("/").split("/")
-            if secrets.compare_digest(token.encode(), self.server.token.encode()):
-                return parts
-            self._refuse(HTTPStatus.FORBIDDEN, "open the address that jaxbl explore printed")
+            reason = "open the address that jaxbl explore printed"
+        self._refuse(HTTPStatus.FORBIDDEN, reason)
         return None
 
     def _send_file(self, file: Path) -> None:
         """A file, or the bytes of it that are asked for."""
-        kind = _KINDS.get(file.suffix, "application/octet-stream")
-        size = file.stat().st_size
+        kind, content = _KINDS.get(file.suffix, "application/octet-stream"), np.memmap(file, mode="r")
         asked = re.fullmatch(r"bytes=(\d{1,15})-(\d{1,15})", self.headers.get("Range", ""))
-        start, end = (int(asked[1]), min(int(asked[2]) + 1, size)) if asked else (0, size)
-        if start >= end:
-            self._send(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers={"Content-Range": f"bytes */{size}"})
+        if asked is None:
+            self._send(HTTPStatus.OK, content.tobytes(), Content_Type=kind)
             return
-        with file.open("rb") as content:
-            content.seek(start)
-            part = content.read(end - start)
-        if asked:
-            self._send(HTTPStatus.PARTIAL_CONTENT, part, kind, {"Content-Range": f"bytes {start}-{end - 1}/{size}"})
+        start, last = map(int, asked.groups())
+        if part := content[start : last + 1].tobytes():
+            place = f"bytes {start}-{start + len(part) - 1}/{len(content)}"
+            self._send(HTTPStatus.PARTIAL_CONTENT, part, Content_Type=kind, Content_Range=place)
         else:
-            self._send(HTTPStatus.OK, part, kind)
+            self._send(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, Content_Range=f"bytes */{len(content)}")
 
     def _refuse(self, status: HTTPStatus, reason: str) -> None:
         # what was not read of the request would be taken for the next one
         self.close_connection = True
-        self._send(status, json.dumps({"error": reason}).encode(), "application/json")
+        self._send_json(status, {"error": reason})
 
-    def _send(self, status: HTTPStatus, content: bytes = b"", kind: str = "", headers: Mapping[str, str] = {}) -> None:
+    def _send_json(self, status: HTTPStatus, content: Mapping[str, Any]) -> None:
+        self._send(status, json.dumps(content, allow_nan=False).encode(), Content_Type="application/json")
+
+    def _send(self, status: HTTPStatus, content: bytes = b"", **headers: str) -> None:
+        """Send an answer with its headers, and those of every answer."""
         self.send_response(status)
-        content_type = {"Content-Type": kind} if kind else {}
         fixed = {
             "Content-Length": str(len(content)), "Content-Security-Policy": _POLICY, "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer", "Cache-Control": "no-store", "Cross-Origin-Resource-Policy": "same-origin",
         }  # fmt: skip
-        for name, value in (content_type | fixed | dict(headers)).items():
-            self.send_header(name, value)
+        for name, value in (headers | fixed).items():
+            self.send_header(name.replace("_", "-"), value)
         self.end_headers()
         self.wfile.write(content)

@@ -1,6 +1,7 @@
 """Which results lie in a folder, and how they are explored: the one place that knows their files."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from jaxbl.errors import InputError
@@ -35,8 +36,9 @@ def open_source(folder: str | Path) -> Source:
     return _KINDS[newest.name](newest, card.get("title", ""), card.get("sentences", []))
 
 
-def _stage_source(folder: Path, names: tuple[str, ...], sentences: list[str]) -> Source:
-    """The first stage that is there, with the answer and a word on how the others are opened."""
+def _stage_source(command: str, names: tuple[str, ...], file: Path, _: str, sentences: list[str]) -> Source:
+    """The first stage of a command that is there, with the answer and a word on how the others are opened."""
+    folder = file.parent / command
     stages = sorted(place.parent.name for place in folder.glob(f"*/{MANIFEST}"))
     first = next((name for name in names if name in stages), None)
     if first is None:
@@ -52,8 +54,8 @@ _KINDS: dict[str, Callable[[Path, str, list[str]], Source]] = {
     "identification.json": log_source,
     "summary.json": log_source,
     "watch.json": log_source,
-    "tuning.json": lambda file, _, card: _stage_source(file.parent / "tune", ("wide", "coarse"), card),
-    "verdict.json": lambda file, _, card: _stage_source(file.parent / "verify", ("sampled", "drive"), card),
+    "tuning.json": partial(_stage_source, "tune", ("wide", "coarse")),
+    "verdict.json": partial(_stage_source, "verify", ("sampled", "drive")),
     "comparison.json": comparison_source,
 }
 """By the file that each command leaves at last: what is explored, given title and sentences of its page."""

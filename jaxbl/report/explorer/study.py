@@ -15,7 +15,7 @@ from jaxbl.errors import InputError
 from jaxbl.files import check_result, checksum, read_result
 from jaxbl.json_types import JsonObject
 from jaxbl.report.checks import has_words
-from jaxbl.report.maps import axis_words, value_label
+from jaxbl.report.maps import axis_words, drawn_values, value_label
 from jaxbl.report.panels import MAP, pack_numbers
 from jaxbl.report.simulate import error_path
 from jaxbl.report.sweep import answer_sweep
@@ -24,7 +24,7 @@ from jaxbl.sweeps.store import Store, identity
 from jaxbl.sweeps.sweep import StudyResult, open_study
 from jaxbl.sweeps.trial import run, run_perturbed
 
-from .folder import Source, colours_of, drawable, page_values, write_page, write_points
+from .folder import Source, colours_of, drawable, write_page, write_points
 from .grid import dimensions, write_grid
 from .log import observer_errors
 
@@ -71,7 +71,7 @@ def comparison_source(file: Path, _: str, sentences: Sequence[str]) -> Source:
     config = read_config(check_result(folder / "study.toml"))
     if not summary["points"]["both"]:
         raise InputError(f"{folder}: no point is in both studies: there is nothing to show")
-    config = config.model_copy(update={"sweep": config.sweep.model_copy(update={"seeds": 1})})
+    config = config.with_keys("sweep", seeds=1)
     names = [Path(name).name for name in summary["names"]]
 
     def write(out: Path, served: bool) -> bool:
@@ -106,12 +106,12 @@ def write_study(
         Whether runs are still to come.
     """
     config = result.config
-    content = _about(config, result.columns, studies) | {"lead": list(lead), "served": served}
+    content = _about(config, result.columns, studies) | {"lead": lead}
     names = [metric["name"] for metric in content["metrics"]]
     dims = dimensions(config)
     content |= write_cloud(result, names, out) if dims is None else write_grid(result, names, content["first"], out, dims)
-    (out / "study.toml").write_text(config.to_toml(), encoding="utf-8")
-    write_page(out, ("study", "runs", "views"), content, scripts=not served)
+    (out / "study.toml").write_text(content["config"], encoding="utf-8")
+    write_page(out, ("study", "runs", "views"), content, served=served)
     return not result.is_finished(content["found"])
 
 
@@ -130,7 +130,7 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> JsonObjec
 
     def page_columns(frame: pd.DataFrame) -> pd.DataFrame:
         places = {path: frame[path].map(values.index) for path, values in words.items()}
-        return frame.assign(**places, **{name: page_values(frame, name) for name in metrics})
+        return frame.assign(**places, **{name: drawable(drawn_values(frame, name)) for name in metrics})
 
     rows = write_points(out, types, map(page_columns, result.batches()))
     descriptions = [
@@ -188,7 +188,7 @@ def simulated(config: Config, asked: Any) -> JsonObject:
             "error": pack_numbers(drawable(path.error)),
             "slope": pack_numbers(drawable(path.slope)),
             "reach": path.reach,
-            "majorant": [*map(pack_numbers, path.majorant)] if len(path.majorant[0]) else None,
+            "majorant": [*map(pack_numbers, path.majorant)],
         }
     return {
         "every": step,

@@ -11,7 +11,7 @@ import pytest
 
 from jaxbl.errors import InputError
 from jaxbl.report.explorer.folder import Source
-from jaxbl.report.explorer.server import start_server
+from jaxbl.report.explorer.server import ExplorerServer
 
 
 def write_page(out: Path, served: bool) -> bool:
@@ -30,7 +30,7 @@ def answer(question):
 
 @pytest.fixture
 def server():
-    with start_server(Source("", [], write_page, {"run": answer}, lambda: None, lambda: None)) as explorer:
+    with ExplorerServer(Source("", [], write_page, {"run": answer}, lambda: None, lambda: None)) as explorer:
         threading.Thread(target=explorer.serve_forever, daemon=True).start()
         yield explorer
         explorer.shutdown()
@@ -118,7 +118,7 @@ def test_a_page_that_is_left_while_it_is_read_says_nothing(capfd, monkeypatch):
         (out / "index.html").write_bytes(bytes(1 << 25))
         return False
 
-    with start_server(Source("", [], write, {}, lambda: None, lambda: None)) as server:
+    with ExplorerServer(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         server.newest()
         address = f"127.0.0.1:{server.server_port}"
@@ -160,7 +160,7 @@ def test_a_page_loaded_again_is_the_newest():
         (out / "index.html").write_text(str(len(left)))
         return left.pop(0)
 
-    with start_server(Source("", [], write, {}, lambda: None, lambda: None)) as server:
+    with ExplorerServer(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         assert request_path(server, "")[1]["Location"] == f"{server.url}1/index.html"
         assert request_path(server, "1/index.html")[2] == b"3"
@@ -184,7 +184,7 @@ def test_results_that_cannot_be_read_are_told_and_read_later():
             raise errors.pop(0)
         return False
 
-    with start_server(Source("", [], write, {}, lambda: None, lambda: None)) as server:
+    with ExplorerServer(Source("", [], write, {}, lambda: None, lambda: None)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         for name in ("study.toml: is missing", "no space left"):
             status, _, content = request_path(server, "")
@@ -197,6 +197,6 @@ def test_a_port_of_another_program(server):
     source = Source("", [], write_page, {}, lambda: None, lambda: None)
     with (
         pytest.raises(InputError, match=f"--port {server.server_port}: .*; choose another one"),
-        start_server(source, server.server_port),
+        ExplorerServer(source, server.server_port),
     ):
         pass

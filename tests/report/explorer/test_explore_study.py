@@ -18,7 +18,7 @@ from jaxbl.config import read_config
 from jaxbl.errors import InputError
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.explorer.folder import Source, write_static
-from jaxbl.report.explorer.server import start_server
+from jaxbl.report.explorer.server import ExplorerServer
 from jaxbl.report.explorer.study import nearby, simulated, study_source, write_study
 from jaxbl.report.maps import best_gains, worst_runs
 from jaxbl.sweeps.sweep import open_study, share, sweep
@@ -297,8 +297,7 @@ def test_the_first_view_is_the_slice_with_a_border_and_has_the_best_gains(tmp_pa
     write_static(make_source(result), tmp_path)
     data = read_data(tmp_path)
     assert data["start"] == {"x": 1, "y": 2, "at": [1, 0, 0, 0]}
-    stars = {star["at"][0]: star for star in data["stars"]}
-    assert stars[1]["first"] and not stars[0]["first"]
+    assert [star[0] for star in data["stars"]] == [1, 0]
     # of the gains of least error those that may change most, as in the report
     runs = worst_runs(
         Groups([result.frame[result.frame[NOISE] > 5e-5]], [LAMBDA, ALPHA], [LAMBDA, ALPHA, "seed"]),
@@ -307,7 +306,7 @@ def test_the_first_view_is_the_slice_with_a_border_and_has_the_best_gains(tmp_pa
     best = best_gains(runs)
     place = runs.index[best.index]
     axes = [axis["paths"][0]["values"] for axis in data["axes"]]
-    assert (axes[2][stars[1]["at"][2]], axes[1][stars[1]["at"][1]]) == place
+    assert (axes[2][data["stars"][0][2]], axes[1][data["stars"][0][1]]) == place
     assert data["overview"]["shape"] == [5, 6]
 
 
@@ -425,7 +424,7 @@ CLICKS = """async () => {
 
 @needs_chromium
 def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folder, tmp_path):
-    with start_server(study_source(swept_folder)) as server:
+    with ExplorerServer(study_source(swept_folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with open_pages(server.url) as (page,):
             page.wait_for_selector("body[data-drawn^='motor.velocity_rmse ']")
@@ -503,7 +502,7 @@ def test_a_click_simulates_the_run_which_can_be_pinned_and_run_again(swept_folde
 
 def test_a_study_at_work_is_written_anew_when_its_page_is_loaded_again(tmp_path):
     share(SWEEP_STUDY, tmp_path / "out", (1, 2))
-    with start_server(study_source(tmp_path / "out")) as server:
+    with ExplorerServer(study_source(tmp_path / "out")) as server:
 
         def read_version(version):
             file = server.file(version, "data.js")

@@ -96,13 +96,13 @@ class Runs {
       })));
     }
     for (const side of SIDES.filter((one) => newest.planes[one] && !apart)) {
-      const drawn = [newest, ...others].filter((run) => run.planes[side]), bounded = drawn.some((run) => run.planes[side].majorant);
+      const drawn = [newest, ...others].filter((run) => run.planes[side]), bounded = drawn.some((run) => run.planes[side].majorant[0]);
       const [x, y] = [0, 1].map((i) => Math.max(...drawn.map((run) => run.planes[side].reach[i]))).map((reach) => (reach > 0 ? [-reach, reach] : null));
       const title = `${side}: error of the observer in the phase plane${bounded ? ", dashed: majorant of the proof (36)-(37)" : "; no peak stands out from the chatter"}`;
       add({ title, x: { label: "position error e", unit: "rad", ends: x }, y: { name: "its slope ė", unit: "rad/s", ends: y } }, drawn.flatMap((run) => {
         const { error, slope, majorant } = run.planes[side], line = (name, along, up, look) => ({ name: named(run, name), x: unpacked(along), y: unpacked(up), colour: run.colour, ...look });
         const lines = [line("error", error, slope, { width: run === newest ? 1.5 : 1 })];
-        return majorant ? [...lines, line("majorant", ...majorant, { dash: [2, 3], ...(others.length ? {} : { colour: GREY }) })] : lines;
+        return majorant[0] ? [...lines, line("majorant", ...majorant, { dash: [2, 3], ...(others.length ? {} : { colour: GREY }) })] : lines;
       }));
     }
     // their widths are known when all are there

@@ -99,7 +99,7 @@ class Maps extends View {
   curve(bound, { x, y }, name) {
     if (!(bound > 0)) return null;
     const { alpha, lambda, title } = this.study.conditions.find((one) => one.name === name);
-    const places = (dim) => (dim.path.endsWith(".alpha") ? alpha.map((one) => dim.place(one * bound)) : lambda.map((one) => dim.place(one * Math.sqrt(bound))));
+    const places = (dim) => (dim.path.endsWith(".alpha") ? Array.from(unpacked(alpha), (one) => dim.place(one * bound)) : Array.from(unpacked(lambda), (one) => dim.place(one * Math.sqrt(bound))));
     return { title, x: places(x), y: places(y) };
   }
   draw(panels) {
@@ -127,7 +127,7 @@ class Maps extends View {
         zoomed: (range) => page.change({ region: range ? [0, 1].flatMap((end) => [x, y].map((dim, i) => (range[i] ? dim.index(range[i][end]) + end : [from, to][end][i]))).join("~") : "" }),
         picked: (found) => { const cell = found.place ? [x.index(found.place[0]), y.index(found.place[1])] : this.cursor?.cell; if (cell) page.take(this.row(view, cell)); },
       });
-      const star = study.stars.find((one) => (!this.mask || this.mask[this.row(view, [x, y].map((dim) => one.at[dim.i]))]) && one.metric === metric && [x, y].every((dim) => [study.start.x, study.start.y].includes(dim.i)) && study.dims.every((dim) => [x, y].includes(dim) || dim.seed || view.at[dim.i] === one.at[dim.i]));
+      const star = study.stars.find((one) => (!this.mask || this.mask[this.row(view, [x, y].map((dim) => one[dim.i]))]) && metric === study.first && [x, y].every((dim) => [study.start.x, study.start.y].includes(dim.i)) && study.dims.every((dim) => [x, y].includes(dim) || dim.seed || view.at[dim.i] === one[dim.i]));
       return { chart, view, star };
     });
     this.mark();
@@ -149,7 +149,7 @@ class Maps extends View {
     for (const { chart, view, star } of this.panels) {
       const { x, y } = view, here = at && this.study.dims.every((dim) => dim === x || dim === y || view.at[dim.i] === "all" || view.at[dim.i] === at[dim.i]);
       const cell = this.cursor?.chart === chart && this.cursor.cell;
-      const marks = [at && [at[x.i], at[y.i], here ? "ring" : "ghost"], cell && [...cell, "ring"], star && [star.at[x.i], star.at[y.i], "star"]];
+      const marks = [at && [at[x.i], at[y.i], here ? "ring" : "ghost"], cell && [...cell, "ring"], star && [star[x.i], star[y.i], "star"]];
       chart.mark(marks.filter(Boolean).map(([i, j, kind]) => [x.edge(i), y.edge(j), kind]));
     }
   }
@@ -354,8 +354,9 @@ class Page {
     this.form();
     const first = Object.keys(address.read()).every((name) => ["row", "pins", "how", "condition"].includes(name)) && study.grid;
     if (first) { $("chosen").hidden = !study.stars.length; this.shown.first(); document.body.dataset.drawn = "overview"; }
-    const star = study.stars?.find((one) => one.first);
-    if (view.row === "" && star && first) view.row = String(study.dims.reduce((sum, dim) => sum + dim.stride * (star.at[dim.i] ?? 0), 0));
+    // that of the slice which is shown first, if it has one
+    const star = study.stars?.find((one) => study.dims.every((dim) => [study.start.x, study.start.y].includes(dim.i) || one[dim.i] === study.start.at[dim.i]));
+    if (view.row === "" && star && first) view.row = String(study.dims.reduce((sum, dim) => sum + dim.stride * star[dim.i], 0));
     $("chosen").hidden = view.row === "";
     await this.update();
     if (!this.runs || view.row === "") return;
