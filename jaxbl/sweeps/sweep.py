@@ -21,7 +21,7 @@ from .bundles import ClusterRun
 from .engine import Engine, SweepEstimate
 from .metrics import find_metric
 from .programs import Backend
-from .run import MemoryStore, StudyRun, join_store, open_or_create_store
+from .run import MemoryStore, StudyRun, join_store
 from .status import Status, status
 from .store import Store, load_config
 
@@ -205,7 +205,7 @@ def sweep(
         engine.compile_all()
     with connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
-            engine, store = open_or_create_store(folder, engine, overwrite=overwrite)
+            store = Store.create(folder, engine, overwrite=overwrite)
             store.list_indices()
             if cluster is None:
                 run = StudyRun(engine, store, progress)
@@ -228,9 +228,8 @@ def _make_engine(study: ConfigSource, backend: Backend | None, devices: list[Any
 
 
 def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
-    totals = run.totals
-    cost = {name: getattr(totals, name) for name in ("compile_seconds", "run_seconds", "lanes")}
-    return StudyResult(run.engine.config, source, cost, totals.fallback_reasons, totals.damaged)
+    engine = run.engine
+    return StudyResult(engine.config, source, engine.cost, tuple(engine.fallback_reasons), tuple(run.store.damaged))
 
 
 def share(
@@ -262,7 +261,7 @@ def share(
     folder, engine = to_path(out), _make_engine(study, backend, devices)
     _check_independent(engine, "--share")
     number, count = portion
-    with join_store(folder, engine) as (engine, store):
+    with join_store(folder, engine) as store:
         StudyRun(engine, store, progress).compute_share(engine.chunk_order()[number - 1 :: count])
     return status(folder)
 
@@ -288,7 +287,7 @@ def submit(
     with connect(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
-        with join_store(folder, engine) as (engine, store):
+        with join_store(folder, engine) as store:
             ClusterRun(cluster, engine, store).submit_missing()
     return status(folder)
 
@@ -324,7 +323,7 @@ def repair(folder: str | Path) -> tuple[int, Store]:
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
     config = load_config(folder)
     with lock_folder(folder):
-        _, store = open_or_create_store(folder, Engine(config))
+        store = Store.create(folder, Engine(config))
         return store.verify(), store
 
 
