@@ -80,13 +80,11 @@ class Cluster:
                 yield results.pop(following)
                 following += 1
 
-    def run_jobs(
-        self, function: Callable[[Job], Result], jobs: Iterable[Job], poll: Callable[[], object] = lambda: None
-    ) -> Iterator[tuple[int, Job, Result]]:
+    def run_jobs(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[int, Job, Result]]:
         """Run jobs on the workers, and yield the number, argument and result of each job that has ended.
 
         Jobs begin in their order; if a worker is lost, another one runs its job again. `jobs` is read as workers become
-        free, and `poll` is called from time to time meanwhile.
+        free.
 
         Raises:
             InputError, NoResult: of a job, of workers that cannot run one, or where the scheduler is lost.
@@ -121,7 +119,6 @@ class Cluster:
                 for future in batch:
                     index, job, _ = begun.pop(future.key)
                     yield index, job, self._result(future)
-                poll()
                 if not batch:
                     time.sleep(_POLL_SECONDS)
         finally:

@@ -27,8 +27,6 @@ _MAX_BUNDLES = 50_000
 """Bundles of a study: a scheduler holds some 6 kB of each, and is slow above 100 000 (Dask's distributed#3691, #3898)."""
 _BUNDLES_PER_WORKER = 4
 """Least number of bundles for each worker, so that the workers end together."""
-_POLL_SECONDS = 2.0
-"""Time between two counts of the stored parts."""
 _DELAY_SECONDS = 30.0
 """Time until a file that another machine has written is seen: a network file system remembers that it was not there."""
 
@@ -50,27 +48,30 @@ class ClusterRun(StudyRun):
         self._cluster = cluster
         study = str(store.folder.absolute()), store.manifest["identity"], engine.require_backend
         self._compute_bundle = partial(compute_bundle, *study)
-        self._next_poll = time.monotonic() + _POLL_SECONDS
 
     def compute_missing(self, chunks: Iterable[Chunk]) -> None:
-        self._compute_bundles(self._compute_first(chunks, max(self._cluster.workers, 1)))
+        self._compute_bundles(self._make_bundles(list(self.missing_chunks(chunks))))
 
     def submit_missing(self) -> None:
-        """Have workers compute all missing chunks, waiting for the first alone."""
-        bundles = self._compute_first(map(self.engine.chunk, self.engine.chunk_order()), 1)
-        self._cluster.submit_jobs(self._compute_bundle, list(bundles))
+        """Have workers compute all missing chunks, waiting for the first alone: it shows that they can, and how fast."""
+        missing = list(self.missing_chunks(map(self.engine.chunk, self.engine.chunk_order())))
+        self._compute_bundles([chunk] for chunk in missing[:1])
+        self._cluster.submit_jobs(self._compute_bundle, list(self._make_bundles(missing[1:])))
 
-    def _compute_first(self, chunks: Iterable[Chunk], count: int) -> Iterator[Bundle]:
-        """Have so many of the missing chunks computed, which shows how long a chunk takes, and bundle the other ones."""
-        missing, before = list(self.missing_chunks(chunks)), self.engine.cost["run_seconds"]
-        self._compute_bundles([chunk] for chunk in missing[:count])
-        seconds, following = (self.engine.cost["run_seconds"] - before) / count, missing[count:]
-        size = _bundle_size(seconds, len(following), max(self._cluster.workers, 1))
-        return (following[first : first + size] for first in range(0, len(following), size))
+    def _make_bundles(self, chunks: Sequence[Chunk]) -> Iterator[Bundle]:
+        """Yield bundles as they are asked for, of one chunk each until it is known how long a chunk takes."""
+        first, workers = 0, max(self._cluster.workers, 1)
+        while first < len(chunks):
+            cost, size = self.engine.cost, 1
+            if cost["lanes"]:
+                seconds = cost["run_seconds"] / cost["lanes"] * chunks[first].lanes
+                size = _bundle_size(seconds, len(chunks), workers)
+            yield chunks[first : first + size]
+            first += size
 
     def _compute_bundles(self, bundles: Iterable[Bundle]) -> None:
         """Have workers compute bundles, and count what these cost as the engine's own."""
-        for _, bundle, worked in self._cluster.run_jobs(self._compute_bundle, bundles, self._poll_parts):
+        for _, bundle, worked in self._cluster.run_jobs(self._compute_bundle, bundles):
             cost, fallback_reasons, damaged, host = worked
             for chunk in bundle:
                 _wait_for_part(self.store.part_path(chunk.index), host)
@@ -78,14 +79,6 @@ class ClusterRun(StudyRun):
             self.engine.cost = {name: amount + cost[name] for name, amount in self.engine.cost.items()}
             self.engine.fallback_reasons |= fallback_reasons
             self.store.damaged += damaged
-
-    def _poll_parts(self) -> None:
-        """Report progress by the number of stored parts, since a bundle takes long."""
-        if time.monotonic() > self._next_poll:
-            start = time.monotonic()
-            self.report_progress(len(self.store.list_part_files()))
-            # a list of 300 000 files takes seconds
-            self._next_poll = time.monotonic() + max(_POLL_SECONDS, 10.0 * (time.monotonic() - start))
 
 
 def _bundle_size(seconds: float, chunks: int, workers: int) -> int:

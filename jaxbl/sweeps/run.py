@@ -74,7 +74,7 @@ class StudyRun:
 
     def compute_share(self, indices: Sequence[int]) -> None:
         """Compute the chunks with some indices, in their order; the progress is of these."""
-        self._chunks, self._total = len(indices), sum(self.engine.chunk(index).lanes for index in indices)
+        self._total = sum(self.engine.chunk(index).lanes for index in indices)
         self.compute_missing(map(self.engine.chunk, indices))
 
     def compute_all(self) -> None:
@@ -164,10 +164,5 @@ class StudyRun:
     def count_chunk(self, chunk: Chunk) -> None:
         """Count the lanes of a chunk as done, and report progress."""
         self._done += chunk.lanes
-        self.report_progress()
-
-    def report_progress(self, parts: int = 0) -> None:
-        """Report the lanes that are done: those that were counted, or more if so many parts are stored."""
         if self.progress:
-            stored = parts * self._total // max(self._chunks, 1)
-            self.progress(min(max(self._done, stored), self._total), self._total)
+            self.progress(self._done, self._total)
