@@ -130,4 +130,6 @@ def compute_bundle(
 @functools.lru_cache(maxsize=2)
 def _cached_engine(folder: str, identity: str, layout: Layout, backend: Backend, require_backend: bool) -> Engine:
     """The engine of a study; the next bundle of the study gets the same one, with its compiled programs."""
-    return Engine(load_config(to_path(folder)), layout, backend=backend, require_backend=require_backend)
+    engine = Engine(load_config(to_path(folder)), layout, backend=backend)
+    engine.require_backend = require_backend
+    return engine

@@ -22,7 +22,7 @@ from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
-from .costs import Operations, can_run_fused, count_operations, lanes_at_once, load_costs
+from .costs import Operations, count_operations, lanes_at_once, load_costs
 from .metrics import add_gain_metrics, compile_gain_metrics
 from .points import PointIndices, Points
 from .programs import (
@@ -32,6 +32,7 @@ from .programs import (
     Layout,
     Program,
     RecentPrograms,
+    can_run_fused,
     check_backend,
     compile_program,
     computed_metrics,
@@ -103,11 +104,10 @@ class Engine:
         config: the study.
         layout: chunk shape; left out, one that suits the devices.
         devices: JAX devices to use; left out, all local ones.
-        backend: left out, the faster one here.
-        require_backend: refuse a study that the fused loop cannot run; otherwise the scan runs it, and `fallback_reasons`
-            says why.
+        backend: required; left out, the faster one here, and the scan where the fused loop does not support a group.
 
     Attributes:
+        require_backend: refuse a study that the fused loop cannot run; otherwise `fallback_reasons` says why the scan does.
         cost: seconds of compilation and of computing, and number of lanes, so far.
         fallback_reasons: what the fused loop does not support, of groups that the scan computed in its place.
     """
@@ -118,12 +118,11 @@ class Engine:
         layout: Layout | None = None,
         devices: list[Any] | None = None,
         backend: Backend | None = None,
-        require_backend: bool = False,
     ):
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        self.require_backend = require_backend
+        self.require_backend = backend is not None
         self.cost: dict[str, float] = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0}
         self.fallback_reasons: dict[str, None] = {}
         chosen = check_backend(backend) or self._choose_backend()

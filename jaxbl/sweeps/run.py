@@ -43,7 +43,6 @@ def join_store(folder: Path, engine: Engine) -> Iterator[Store]:
 class MemoryStore(dict[int, pd.DataFrame]):
     """Rows of chunks by index, in place of a :class:`jaxbl.sweeps.store.Store`, for a study without a folder."""
 
-    damaged: Sequence[str] = ()
     write_part = dict.__setitem__
 
     def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:

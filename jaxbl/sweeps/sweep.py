@@ -189,20 +189,17 @@ def sweep(
             another study, the backend cannot run the study, or no cluster answers.
         NoResult: the disk is full, or the cluster is lost; parts that were written are whole.
     """
-    engine = _make_engine(study, backend, devices)
-    if out is None:
-        if scheduler is not None:
-            raise InputError("--scheduler: its workers write into a folder; name it with --out")
-        if backend == "fused":
-            engine.compile_all()
-        memory = MemoryStore()
-        run = StudyRun(engine, memory, progress)
-        run.compute_all()
-        return _make_result(run, memory.frame())
-    folder = to_path(out)
-    if backend == "fused" and not (folder / MANIFEST).exists():
+    engine = Engine(read_config(study), devices=devices, backend=backend)
+    if out is None and scheduler is not None:
+        raise InputError("--scheduler: its workers write into a folder; name it with --out")
+    folder = None if out is None else to_path(out)
+    if backend == "fused" and not (folder and (folder / MANIFEST).exists()):
         # a backend that cannot run the study is refused before anything is written
         engine.compile_all()
+    if folder is None:
+        memory = MemoryStore()
+        StudyRun(engine, memory, progress).compute_all()
+        return _make_result(engine, memory.frame())
     with connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
             store = Store.create(folder, engine, overwrite=overwrite)
@@ -219,17 +216,11 @@ def sweep(
             # this removes drafts of workers that were lost, too
             with lock_folder(folder, wait=_RELEASE_SECONDS):
                 run.mark_finished()
-    return _make_result(run, store)
+    return _make_result(engine, store, store.damaged)
 
 
-def _make_engine(study: ConfigSource, backend: Backend | None, devices: list[Any] | None = None) -> Engine:
-    """Make the engine of a study; it requires the backend if one is chosen."""
-    return Engine(read_config(study), devices=devices, backend=backend, require_backend=backend is not None)
-
-
-def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
-    engine = run.engine
-    return StudyResult(engine.config, source, engine.cost, tuple(engine.fallback_reasons), tuple(run.store.damaged))
+def _make_result(engine: Engine, source: Store | pd.DataFrame, damaged: Iterable[str] = ()) -> StudyResult:
+    return StudyResult(engine.config, source, engine.cost, tuple(engine.fallback_reasons), tuple(damaged))
 
 
 def share(
@@ -258,7 +249,7 @@ def share(
         InputError: as for :func:`sweep`; or the study is refined, so that its points depend on one another.
         NoResult: the disk is full.
     """
-    folder, engine = to_path(out), _make_engine(study, backend, devices)
+    folder, engine = to_path(out), Engine(read_config(study), devices=devices, backend=backend)
     _check_independent(engine, "--share")
     number, count = portion
     with join_store(folder, engine) as store:
@@ -282,7 +273,7 @@ def submit(
         InputError: as for :func:`sweep`; or the study is refined, so that its points depend on one another, or the cluster
             would end with this process.
     """
-    folder, engine = to_path(out), _make_engine(study, backend, devices)
+    folder, engine = to_path(out), Engine(read_config(study), devices=devices, backend=backend)
     _check_independent(engine, "--detach")
     with connect(scheduler) as cluster:
         if cluster is None or cluster.local:
@@ -329,4 +320,4 @@ def repair(folder: str | Path) -> tuple[int, Store]:
 
 def dry_run(study: ConfigSource, *, backend: Backend | None = None) -> SweepEstimate:
     """Estimate time and memory of a study by a compilation and short runs; for a refined study, of its coarse grid."""
-    return _make_engine(study, backend).estimate()
+    return Engine(read_config(study), backend=backend).estimate()
