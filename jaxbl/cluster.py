@@ -91,7 +91,8 @@ class Cluster:
         """
         from distributed import as_completed
 
-        waiting, begun = enumerate(jobs), {}
+        waiting = enumerate(jobs)
+        begun: dict[Any, tuple[int, Job]] = {}
         finished = as_completed(loop=self._client.loop)
         most, next_count, last_worker = 0, 0.0, time.monotonic()
         try:
@@ -109,7 +110,7 @@ class Cluster:
                         announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
-                begun |= {future.key: (*numbered, future) for future, numbered in zip(futures, more, strict=True)}
+                begun.update(zip(futures, more, strict=True))
                 finished.update(futures)
                 # what is not referred to any more, the scheduler forgets
                 del futures
@@ -117,13 +118,12 @@ class Cluster:
                     return
                 batch = list(finished.next_batch(block=False))
                 for future in batch:
-                    index, job, _ = begun.pop(future.key)
-                    yield index, job, self._result(future)
+                    yield *begun.pop(future), self._result(future)
                 if not batch:
                     time.sleep(_POLL_SECONDS)
         finally:
             if begun and self._client.status == "running":
-                self._client.cancel([future for *_, future in begun.values()], force=True)
+                self._client.cancel([*begun], force=True)
 
     def submit_jobs(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
         """Have jobs done without waiting for them, also when this process has ended."""

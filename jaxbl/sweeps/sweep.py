@@ -208,9 +208,8 @@ def sweep(
                 run = StudyRun(engine, store, progress)
                 run.compute_all()
                 run.mark_finished()
-            else:
-                run = ClusterRun(cluster, engine, store, progress)
         if cluster is not None:
+            run = ClusterRun(cluster, engine, store, progress)
             with lock_folder(folder, shared=True):
                 run.compute_all()
             # this removes drafts of workers that were lost, too
