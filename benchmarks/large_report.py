@@ -19,7 +19,7 @@ import pandas as pd
 
 from jaxbl.config import read_config
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.run import open_or_create_store
+from jaxbl.sweeps.store import Store
 
 SIDE = 100
 """Values of both axes of the map."""
@@ -54,7 +54,8 @@ finally:
 def make(folder: Path, rows: int) -> int:
     """Write a study of so many rows, to the next whole seed. Returns its rows."""
     config = read_config(_STUDY | {"sweep": {"seeds": -(-rows // SIDE**2), "chunk": 32768}})
-    engine, store = open_or_create_store(folder, Engine(config, backend="fused"))
+    engine = Engine(config, backend="fused")
+    store = Store.create(folder, engine)
     rng = np.random.default_rng(0)
     for index in range(len(engine)):
         labels = engine.row_labels(engine.chunk(index))

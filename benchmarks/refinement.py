@@ -71,26 +71,26 @@ def main():
     chunks = list(engine.chunks())
     chosen = np.unique(np.linspace(0, len(chunks) - 1, len(chunks) if options.full else options.chunks).astype(int))
     engine.run(chunks[0])  # compiles
-    engine.run_seconds = 0.0
+    engine.cost["run_seconds"] = 0.0
     parts, rounds = [], []
     for i in range(options.rounds):
         start = time.perf_counter()
         result = sweep(config)
         rounds.append({"wall": time.perf_counter() - start, **result.cost})
         parts += [engine.run(chunks[k]) for k in chosen[i :: options.rounds]]
-    whole_run = engine.run_seconds / len(chosen) * len(chunks)
+    whole_run = engine.cost["run_seconds"] / len(chosen) * len(chunks)
     points = len(engine.points)
     print(f"points: {len(result.frame)} of {points} ({100 * len(result.frame) / points:.2f} %)")
     # everything but compilation: choosing points, frames
     refined_run = np.mean([r["wall"] - r["compile_seconds"] for r in rounds])
     compile_seconds = np.mean([r["compile_seconds"] for r in rounds])
     kind = "" if options.full else f", from {len(chosen)} of {len(chunks)} chunks of {engine.layout.points}"
-    print(f"full grid: {whole_run:.1f} s{kind}; compilation {engine.compile_seconds:.1f} s")
+    print(f"full grid: {whole_run:.1f} s{kind}; compilation {engine.cost['compile_seconds']:.1f} s")
     print(
         f"refined:   {refined_run:.2f} s, of which in the program {np.mean([r['run_seconds'] for r in rounds]):.2f}; "
         f"compilation {compile_seconds:.1f} s"
     )
-    together = (whole_run + engine.compile_seconds) / (refined_run + compile_seconds)
+    together = (whole_run + engine.cost["compile_seconds"]) / (refined_run + compile_seconds)
     print(f"ratio: {whole_run / refined_run:.1f}; with compilation {together:.1f}")
     if options.full:
         full = pd.concat(parts, ignore_index=True)
@@ -107,9 +107,9 @@ def main():
         other.run(chunk)
         seconds = []
         for _ in range(4):
-            before = other.run_seconds
+            before = other.cost["run_seconds"]
             other.run(chunk)
-            seconds.append(other.run_seconds - before)
+            seconds.append(other.cost["run_seconds"] - before)
         print(f"chunk of {size}: {min(seconds):.3f} s, {1e9 * min(seconds) / size / config.run.steps:.1f} ns a lane-step")
 
 

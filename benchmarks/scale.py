@@ -25,7 +25,7 @@ start_jax()
 
 from jaxbl.config import read_config  # noqa: E402
 from jaxbl.sweeps.engine import Engine  # noqa: E402
-from jaxbl.sweeps.store import Store, claim_study  # noqa: E402
+from jaxbl.sweeps.store import Store  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 
@@ -60,7 +60,7 @@ def measure(data: dict[str, Any], folder: Path) -> Cost:
     """Cost of a run, by all chunks of a study after a first one."""
     config = read_config(data)
     engine = Engine(config)
-    store = Store.create(claim_study(folder, config), engine)
+    store = Store.create(folder, engine)
     store.write_part(0, engine.run(engine.chunk(0)))
     start = time.process_time()
     frames = [engine.run(engine.chunk(index)) for index in range(len(engine))]

@@ -80,20 +80,19 @@ class Cluster:
                 yield results.pop(following)
                 following += 1
 
-    def run_jobs(
-        self, function: Callable[[Job], Result], jobs: Iterable[Job], poll: Callable[[], object] = lambda: None
-    ) -> Iterator[tuple[int, Job, Result]]:
+    def run_jobs(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[int, Job, Result]]:
         """Run jobs on the workers, and yield the number, argument and result of each job that has ended.
 
         Jobs begin in their order; if a worker is lost, another one runs its job again. `jobs` is read as workers become
-        free, and `poll` is called from time to time meanwhile.
+        free.
 
         Raises:
             InputError, NoResult: of a job, of workers that cannot run one, or where the scheduler is lost.
         """
         from distributed import as_completed
 
-        waiting, begun = enumerate(jobs), {}
+        waiting = enumerate(jobs)
+        begun: dict[Any, tuple[int, Job]] = {}
         finished = as_completed(loop=self._client.loop)
         most, next_count, last_worker = 0, 0.0, time.monotonic()
         try:
@@ -111,7 +110,7 @@ class Cluster:
                         announce("waiting for workers: the scheduler has none")
                 more = list(islice(waiting, max(most - len(begun), 0)))
                 futures = self._submit(function, [job for _, job in more])
-                begun |= {future.key: (*numbered, future) for future, numbered in zip(futures, more, strict=True)}
+                begun.update(zip(futures, more, strict=True))
                 finished.update(futures)
                 # what is not referred to any more, the scheduler forgets
                 del futures
@@ -119,14 +118,12 @@ class Cluster:
                     return
                 batch = list(finished.next_batch(block=False))
                 for future in batch:
-                    index, job, _ = begun.pop(future.key)
-                    yield index, job, self._result(future)
-                poll()
+                    yield *begun.pop(future), self._result(future)
                 if not batch:
                     time.sleep(_POLL_SECONDS)
         finally:
             if begun and self._client.status == "running":
-                self._client.cancel([future for *_, future in begun.values()], force=True)
+                self._client.cancel([*begun], force=True)
 
     def submit_jobs(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> None:
         """Have jobs done without waiting for them, also when this process has ended."""
@@ -233,7 +230,6 @@ def _start_local(scheduler: str) -> "Iterator[Client]":
 
     A scheduler runs the code that it is sent: without keys, that of whoever reaches its port.
     """
-    from dask import config
     from distributed import Client, LocalCluster, Security
 
     number = scheduler.removeprefix("local:")
@@ -249,9 +245,7 @@ def _start_local(scheduler: str) -> "Iterator[Client]":
             "--scheduler local:N: needs cryptography; install it with: pip install 'jaxbl[distributed]'"
         ) from None
     announce("starting workers")
-    # a process that was forked would share the locks of this one's compiler
     with (
-        config.set({"distributed.worker.multiprocessing-method": "spawn"}),
         LocalCluster(
             n_workers=count,
             threads_per_worker=max(count_cores() // count, 1),

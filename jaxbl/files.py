@@ -174,7 +174,7 @@ def list_paths(folder: Path, pattern: str) -> list[Path]:
 
 def remove(path: Path) -> None:
     """Remove a file, or a folder with its contents, if it exists."""
-    if not path.is_dir() or (isinstance(path, Path) and path.is_symlink()):
+    if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
     elif isinstance(path, Path):
         shutil.rmtree(path)

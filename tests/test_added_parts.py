@@ -177,7 +177,7 @@ study |= {"controller": {"kind": "spring", "gain": 0.1}, "reference": {"kind": "
 config = jaxbl.read_config(study | {"axes": [{"path": "transmission.cubic", "values": [20.0, 40.0]}]})
 frames = {}
 for backend in ("fused", "scan"):
-    engine = Engine(config, backend=backend, require_backend=True)
+    engine = Engine(config, backend=backend)
     frames[backend] = engine.run(engine.chunk(0))[["motor.velocity_peak", "motor.cubic_error"]].values.tolist()
 trace = jaxbl.run(study).trace
 faults = []

@@ -8,8 +8,8 @@ import math
 import socket
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxbl.cluster import Cluster
 from jaxbl.errors import InputError
@@ -18,7 +18,7 @@ from jaxbl.workers import Progress
 
 from .engine import Chunk, Engine
 from .programs import Backend, Layout
-from .run import RunTotals, StudyRun
+from .run import StudyRun
 from .store import Store, load_config
 
 _BUNDLE_SECONDS = 20.0
@@ -27,26 +27,12 @@ _MAX_BUNDLES = 50_000
 """Bundles of a study: a scheduler holds some 6 kB of each, and is slow above 100 000 (Dask's distributed#3691, #3898)."""
 _BUNDLES_PER_WORKER = 4
 """Least number of bundles for each worker, so that the workers end together."""
-_POLL_SECONDS = 2.0
-"""Time between two counts of the stored parts."""
 _DELAY_SECONDS = 30.0
 """Time until a file that another machine has written is seen: a network file system remembers that it was not there."""
 
 
-class Bundle(NamedTuple):
-    """Chunks that a worker computes.
-
-    Attributes:
-        folder: folder of the study.
-        identity: identity of the study in its manifest.
-        require_backend: refuse a study that the fused loop cannot run.
-        chunks: the chunks.
-    """
-
-    folder: str
-    identity: str
-    require_backend: bool
-    chunks: tuple[Chunk, ...]
+Bundle = Sequence[Chunk]
+"""Chunks that a worker computes."""
 
 
 class ClusterRun(StudyRun):
@@ -60,45 +46,39 @@ class ClusterRun(StudyRun):
     def __init__(self, cluster: Cluster, engine: Engine, store: Store, progress: Progress | None = None):
         super().__init__(engine, store, progress)
         self._cluster = cluster
-        self._next_poll = time.monotonic() + _POLL_SECONDS
+        study = str(store.folder.absolute()), store.manifest["identity"], engine.require_backend
+        self._compute_bundle = partial(compute_bundle, *study)
 
     def compute_missing(self, chunks: Iterable[Chunk]) -> None:
-        self._compute_bundles(self._compute_first(chunks, max(self._cluster.workers, 1)))
+        self._compute_bundles(self._make_bundles(list(self.missing_chunks(chunks))))
 
     def submit_missing(self) -> None:
-        """Have workers compute all missing chunks, waiting for the first alone."""
-        bundles = self._compute_first(map(self.engine.chunk, self.engine.chunk_order()), 1)
-        self._cluster.submit_jobs(compute_bundle, list(bundles))
+        """Have workers compute all missing chunks, waiting for the first alone: it shows that they can, and how fast."""
+        missing = list(self.missing_chunks(map(self.engine.chunk, self.engine.chunk_order())))
+        self._compute_bundles([chunk] for chunk in missing[:1])
+        self._cluster.submit_jobs(self._compute_bundle, list(self._make_bundles(missing[1:])))
 
-    def _compute_first(self, chunks: Iterable[Chunk], count: int) -> Iterator[Bundle]:
-        """Have so many of the missing chunks computed, which shows how long a chunk takes, and bundle the other ones."""
-        missing, before = list(self.missing_chunks(chunks)), self.totals.run_seconds
-        first, following = missing[:count], missing[count:]
-        self._compute_bundles(self._make_bundles(first, 1))
-        seconds, workers = (self.totals.run_seconds - before) / count, max(self._cluster.workers, 1)
-        return self._make_bundles(following, _bundle_size(seconds, len(following), workers))
-
-    def _make_bundles(self, chunks: Sequence[Chunk], size: int) -> Iterator[Bundle]:
-        """Make bundles of `size` chunks each."""
-        study = str(self.store.folder.absolute()), self.store.manifest["identity"], self.engine.require_backend
-        for first in range(0, len(chunks), size):
-            yield Bundle(*study, tuple(chunks[first : first + size]))
+    def _make_bundles(self, chunks: Sequence[Chunk]) -> Iterator[Bundle]:
+        """Yield bundles as they are asked for, of one chunk each until it is known how long a chunk takes."""
+        first, workers = 0, max(self._cluster.workers, 1)
+        while first < len(chunks):
+            cost, size = self.engine.cost, 1
+            if cost["lanes"]:
+                seconds = cost["run_seconds"] / cost["lanes"] * chunks[first].lanes
+                size = _bundle_size(seconds, len(chunks), workers)
+            yield chunks[first : first + size]
+            first += size
 
     def _compute_bundles(self, bundles: Iterable[Bundle]) -> None:
-        """Have workers compute bundles."""
-        for _, bundle, (totals, host) in self._cluster.run_jobs(compute_bundle, bundles, self._poll_parts):
-            for chunk in bundle.chunks:
+        """Have workers compute bundles, and count what these cost as the engine's own."""
+        for _, bundle, worked in self._cluster.run_jobs(self._compute_bundle, bundles):
+            cost, fallback_reasons, damaged, host = worked
+            for chunk in bundle:
                 _wait_for_part(self.store.part_path(chunk.index), host)
                 self.count_chunk(chunk)
-            self.worker_totals += totals
-
-    def _poll_parts(self) -> None:
-        """Report progress by the number of stored parts, since a bundle takes long."""
-        if time.monotonic() > self._next_poll:
-            start = time.monotonic()
-            self.report_progress(len(self.store.list_part_files()))
-            # a list of 300 000 files takes seconds
-            self._next_poll = time.monotonic() + max(_POLL_SECONDS, 10.0 * (time.monotonic() - start))
+            self.engine.cost = {name: amount + cost[name] for name, amount in self.engine.cost.items()}
+            self.engine.fallback_reasons |= fallback_reasons
+            self.store.damaged += damaged
 
 
 def _bundle_size(seconds: float, chunks: int, workers: int) -> int:
@@ -120,23 +100,36 @@ def _wait_for_part(part: Path, host: str) -> None:
         time.sleep(0.2)
 
 
-def compute_bundle(bundle: Bundle) -> tuple[RunTotals, str]:
-    """Compute the chunks of a bundle that are not stored; called on a worker. Returns totals, and the worker's host."""
-    folder, host = to_path(bundle.folder), socket.gethostname()
+def compute_bundle(
+    place: str, identity: str, require_backend: bool, bundle: Bundle
+) -> tuple[dict[str, float], dict[str, None], list[str], str]:
+    """Compute the chunks of a bundle that are not stored; called on a worker.
+
+    Args:
+        place: folder of the study.
+        identity: of the study in its manifest.
+        require_backend: refuse a study that the fused loop cannot run.
+        bundle: the chunks.
+
+    Returns:
+        The engine's `cost` of this bundle and `fallback_reasons`, the store's `damaged`, and the worker's host.
+    """
+    folder, host = to_path(place), socket.gethostname()
     if not (folder / MANIFEST).exists():
         raise InputError(f"{folder}: is not seen by worker {host}; --out should name a folder that all machines share")
     with lock_folder(folder, shared=True, wait=_DELAY_SECONDS):
         store = Store.open(folder)
-        if store.manifest["identity"] != bundle.identity:
+        if store.manifest["identity"] != identity:
             raise InputError(f"{folder}: holds another study by now; begin again with another --out")
-        engine = _cached_engine(bundle.folder, bundle.identity, store.layout, store.backend, bundle.require_backend)
-        engine.compile_seconds = engine.run_seconds = 0.0
-        run = StudyRun(engine, store)
-        run.compute_missing(bundle.chunks)
-    return run.totals, host
+        engine = _cached_engine(place, identity, store.layout, store.backend, require_backend)
+        engine.cost = dict.fromkeys(engine.cost, 0)
+        StudyRun(engine, store).compute_missing(bundle)
+    return engine.cost, dict(engine.fallback_reasons), store.damaged, host
 
 
 @functools.lru_cache(maxsize=2)
 def _cached_engine(folder: str, identity: str, layout: Layout, backend: Backend, require_backend: bool) -> Engine:
     """The engine of a study; the next bundle of the study gets the same one, with its compiled programs."""
-    return Engine(load_config(to_path(folder)), layout, backend=backend, require_backend=require_backend)
+    engine = Engine(load_config(to_path(folder)), layout, backend=backend)
+    engine.require_backend = require_backend
+    return engine

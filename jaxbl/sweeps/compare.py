@@ -150,10 +150,7 @@ class Comparison:
         """The comparison as plain data for `comparison.json`."""
         table = {name: entry for name, entry in vars(self).items() if not name.startswith("_")}
         table["points"] = dict(zip(("both", "first_only", "second_only"), self.points, strict=True))
-        table["metrics"] = [
-            dataclasses.asdict(change) | {"moved": change.moved._asdict(), "only": list(change.only)}
-            for change in self.metrics
-        ]
+        table["metrics"] = [dataclasses.asdict(change) | {"moved": change.moved._asdict()} for change in self.metrics]
         return to_jsonable(table)
 
     def frame(self, metric: str) -> pd.DataFrame:
@@ -285,21 +282,20 @@ def _match_points(
     joint = pd.concat(frames, ignore_index=True)
     # without axes all rows are of one point
     groups = joint[paths].apply(_number_values).groupby(paths).ngroup() if paths else np.zeros(len(joint), int)
-    codes = np.split(np.asarray(groups), [len(frames[0])])
-    points = [np.unique(code) for code in codes]
-    common_points = np.intersect1d(*points, assume_unique=True)
-    seeds = [np.unique(frame["seed"]) for frame in frames]
-    common_seeds = np.intersect1d(*seeds)
-    paired = len(common_seeds) >= 2 or min(map(len, seeds)) < 2
+    # the last row of each point and seed
+    first, second = (
+        frame.assign(point=point, row=np.arange(len(frame))).pivot_table("row", "point", "seed", "last")
+        for frame, point in zip(frames, np.split(np.asarray(groups), [len(frames[0])]), strict=True)
+    )
+    points, seeds = first.index.intersection(second.index), first.columns.intersection(second.columns)
+    paired = len(seeds) >= 2 or min(first.shape[1], second.shape[1]) < 2
     matched = []
-    for study, frame, code, study_seeds in zip(studies, frames, codes, seeds, strict=True):
-        runs = frame.assign(point=code, row=np.arange(len(frame)))
-        rows = runs.groupby(["point", "seed"])["row"].last().unstack()
-        row_index = rows.reindex(index=common_points, columns=common_seeds if paired else study_seeds).fillna(-1)
-        axis_values = runs.drop_duplicates("point", keep="last").set_index("point").loc[common_points, paths]
-        matched.append(_MatchedStudy(study, len(frame), row_index.to_numpy(int), axis_values))
-    counts = len(common_points), len(points[0]) - len(common_points), len(points[1]) - len(common_points)
-    return (matched[0], matched[1]), counts, len(common_seeds), paired
+    for study, frame, rows in zip(studies, frames, (first, second), strict=True):
+        rows = rows.loc[points].fillna(-1).astype(int)
+        row_index = rows[seeds] if paired else rows
+        matched.append(_MatchedStudy(study, len(frame), row_index.to_numpy(), frame[paths].iloc[rows.max(axis=1)]))
+    counts = len(points), len(first) - len(points), len(second) - len(points)
+    return (matched[0], matched[1]), counts, len(seeds), paired
 
 
 def _read_keys(study: StudyResult, paths: list[str]) -> pd.DataFrame:

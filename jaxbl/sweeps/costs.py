@@ -139,11 +139,6 @@ def lanes_at_once(devices: Sequence[Any], backend: Backend, operations: Operatio
     return _GPU_LANES if devices[0].platform == "gpu" else load_costs(devices).best_lanes(backend, operations, len(devices))
 
 
-def can_run_fused(devices: Sequence[Any]) -> bool:
-    """True if the fused loop supports some devices."""
-    return devices[0].platform == "cpu" or (devices[0].platform == "gpu" and len(devices) == 1)
-
-
 def count_operations(config: Config, paths: Sequence[str], names: MetricNames = None) -> Operations:
     """Count the operations of a sample.
 

@@ -10,6 +10,8 @@ import itertools
 import math
 import statistics
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +22,7 @@ from jaxbl.chain import NamedArrays
 from jaxbl.config import Config, precision, prepare
 from jaxbl.workers import check_cost
 
-from .costs import Operations, can_run_fused, count_operations, lanes_at_once, load_costs
+from .costs import Operations, count_operations, lanes_at_once, load_costs
 from .metrics import add_gain_metrics, compile_gain_metrics
 from .points import PointIndices, Points
 from .programs import (
@@ -30,6 +32,7 @@ from .programs import (
     Layout,
     Program,
     RecentPrograms,
+    can_run_fused,
     check_backend,
     compile_program,
     computed_metrics,
@@ -101,9 +104,12 @@ class Engine:
         config: the study.
         layout: chunk shape; left out, one that suits the devices.
         devices: JAX devices to use; left out, all local ones.
-        backend: left out, the faster one here.
-        require_backend: refuse a study that the fused loop cannot run; otherwise the scan runs it, and `fallback_reasons`
-            says why.
+        backend: required; left out, the faster one here, and the scan where the fused loop does not support a group.
+
+    Attributes:
+        require_backend: refuse a study that the fused loop cannot run; otherwise `fallback_reasons` says why the scan does.
+        cost: seconds of compilation and of computing, and number of lanes, so far.
+        fallback_reasons: what the fused loop does not support, of groups that the scan computed in its place.
     """
 
     def __init__(
@@ -112,19 +118,28 @@ class Engine:
         layout: Layout | None = None,
         devices: list[Any] | None = None,
         backend: Backend | None = None,
-        require_backend: bool = False,
     ):
         self.config = config
         self.points = Points(config)
         self.devices = devices or jax.local_devices()
-        self.backend: Backend = check_backend(backend) or self._choose_backend()
-        self.require_backend = require_backend
-        self.layout = layout or self._choose_layout(self.backend, config.sweep.chunk)
-        check_cost("a chunk", _LANE_BYTES * math.prod(self.layout), "[sweep] chunk should be smaller, or left out")
-        self.compile_seconds = 0.0
-        self.run_seconds = 0.0
-        self.fallback_reasons: list[str] = []
+        self.require_backend = backend is not None
+        self.cost: dict[str, float] = {"compile_seconds": 0.0, "run_seconds": 0.0, "lanes": 0}
+        self.fallback_reasons: dict[str, None] = {}
+        chosen = check_backend(backend) or self._choose_backend()
+        self.use_layout(layout or self._choose_layout(chosen, config.sweep.chunk), chosen)
+
+    def use_layout(self, layout: Layout, backend: Backend) -> None:
+        """Compute chunks of another shape, or by another backend, from now on."""
+        check_cost("a chunk", _LANE_BYTES * math.prod(layout), "[sweep] chunk should be smaller, or left out")
+        self.layout, self.backend = layout, backend
         self._programs = RecentPrograms()
+
+    @contextmanager
+    def _count_seconds(self, name: str) -> Iterator[None]:
+        """Add the time that the `with` block takes to the cost of this name."""
+        start = time.perf_counter()
+        yield
+        self.cost[name] += time.perf_counter() - start
 
     def _choose_backend(self) -> Backend:
         """The faster backend; it must not depend on the chunk size that is set, since backends round differently."""
@@ -257,14 +272,13 @@ class Engine:
         program = self._program(chunk.group)
         with precision(group.config):
             arguments = self._pad_arguments(group.config, self.points.columns(chunk.points), chunk.seeds)
-            start = time.perf_counter()
-            metrics, gains = jax.block_until_ready(program.run(*arguments))
-            self.run_seconds += time.perf_counter() - start
+            with self._count_seconds("run_seconds"):
+                metrics, gains = jax.block_until_ready(program.run(*arguments))
             # compiled only now, so that the first chunk starts earlier
             self._compile_gain_metrics(group.config.run.precision)
-            start = time.perf_counter()
-            metrics = add_gain_metrics(metrics, gains, self.config.sweep.requested_metrics)
-            self.run_seconds += time.perf_counter() - start
+            with self._count_seconds("run_seconds"):
+                metrics = add_gain_metrics(metrics, gains, self.config.sweep.requested_metrics)
+        self.cost["lanes"] += chunk.lanes
         columns = self.row_labels(chunk)
         for name in self.points.metrics:
             padded = np.asarray(metrics.get(name, np.full(chunk.shape, np.nan)))
@@ -302,37 +316,35 @@ class Engine:
         with precision(config):
             experiment = prepare(config)
             columns, _ = self._pad_arguments(config, self.points.columns(np.arange(1)), range(1))
-            start = time.perf_counter()
-            program = compile_program(
-                experiment,
-                self.layout,
-                self.devices,
-                self.backend,
-                columns,
-                metric_names=config.sweep.requested_metrics,
-                require_backend=self.require_backend,
-            )
-            self.compile_seconds += time.perf_counter() - start
+            with self._count_seconds("compile_seconds"):
+                program = compile_program(
+                    experiment,
+                    self.layout,
+                    self.devices,
+                    self.backend,
+                    columns,
+                    metric_names=config.sweep.requested_metrics,
+                    require_backend=self.require_backend,
+                )
             check_cost("a chunk", 1e6 * program.megabytes, "[sweep] chunk should be smaller, or left out")
             if program.fallback_reason is not None:
-                self.fallback_reasons.append(program.fallback_reason)
+                self.fallback_reasons[program.fallback_reason] = None
             return program
 
     def _compile_gain_metrics(self, dtype: str) -> None:
         """Compile the gain metrics for a precision, unless none are requested."""
-        start = time.perf_counter()
-        compile_gain_metrics(self.config.sweep.requested_metrics, dtype, math.prod(self.layout))
-        self.compile_seconds += time.perf_counter() - start
+        with self._count_seconds("compile_seconds"):
+            compile_gain_metrics(self.config.sweep.requested_metrics, dtype, math.prod(self.layout))
 
     def estimate(self) -> "SweepEstimate":
         """Estimate memory and time of all chunks, by a compilation and short runs of the group with most samples."""
         groups, config, chunk = self.points.groups, self._longest_config, self.chunk(0)
         with without_cache_writes():
             program = self._compile(config)
-            program_seconds = self.compile_seconds
+            program_seconds = self.cost["compile_seconds"]
             with precision(config):
                 self._compile_gain_metrics(config.run.precision)
-        compile_seconds = program_seconds * (len(groups) - 1) + self.compile_seconds
+        compile_seconds = program_seconds * (len(groups) - 1) + self.cost["compile_seconds"]
         backend: Backend = "scan" if program.fallback_reason is not None else self.backend
         # so long that the overhead of a call does not count
         predicted = self._predict_seconds(backend, config)

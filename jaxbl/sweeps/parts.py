@@ -84,8 +84,7 @@ def read_part(path: Path, columns: Sequence[str] | None = None, *, check: bool =
         source = BytesIO(read_checked(path)) if check or is_remote(path) else path.open("rb")
         with source, pq.ParquetFile(source, page_checksum_verification=True) as file:
             header = json.loads((file.schema_arrow.metadata or {})[_KEY])
-            frame = pd.DataFrame() if columns == () else file.read(columns=columns).to_pandas()
-            return PartHeader(**header), frame
+            return PartHeader(**header), file.read(columns=columns).to_pandas()
     except (FileNotFoundError, InputError):
         raise
     except (OSError, ValueError, KeyError, TypeError, MemoryError, pa.ArrowException) as error:

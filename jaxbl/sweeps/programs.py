@@ -2,7 +2,7 @@
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -158,21 +158,25 @@ def compile_program(
     return shared.take(key, compile_backend)
 
 
+def can_run_fused(devices: Sequence[Any]) -> bool:
+    """True if the fused loop supports some devices."""
+    return devices[0].platform == "cpu" or (devices[0].platform == "gpu" and len(devices) == 1)
+
+
 def _compile_fused(
     experiment: Experiment, layout: Layout, devices: list[Any], paths: tuple[str, ...], names: MetricNames
 ) -> Program:
     if not paths:
         raise Unsupported("lanes that differ only in their seed")
+    platform = devices[0].platform
+    if not can_run_fused(devices):
+        raise Unsupported(f"{len(devices)} devices of platform {platform}")
     from jaxbl.fused.lane_simulator import DeviceSimulator, HostSimulator
 
     arguments = experiment, (metrics_reducer(names),), paths, layout.points
     with jax.default_device(devices[0]):
-        if devices[0].platform == "cpu":
-            simulator: LaneSimulator = HostSimulator(*arguments, len(devices))
-        elif devices[0].platform == "gpu" and len(devices) == 1:
-            simulator = DeviceSimulator(*arguments)
-        else:
-            raise Unsupported(f"{len(devices)} devices of platform {devices[0].platform}")
+        on_host = platform == "cpu"
+        simulator: LaneSimulator = HostSimulator(*arguments, len(devices)) if on_host else DeviceSimulator(*arguments)
         # compile the program that draws the noise, now and not with the first chunk
         next(simulator.compute_inputs(0))
 

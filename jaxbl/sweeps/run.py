@@ -1,11 +1,10 @@
 """Computes the chunks of a study that are not stored yet."""
 
-import operator
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,81 +21,28 @@ _PREPARATION_SECONDS = 60.0
 """Longest wait for another process that prepares the folder."""
 
 
-def open_or_create_store(folder: Path, engine: Engine, *, overwrite: bool = False) -> tuple[Engine, Store]:
-    """Open the store of an engine's study in a locked folder (:func:`jaxbl.files.lock_folder`), or create it.
-
-    Returns an engine with the store's layout and backend as well: chunks keep the shape that they had when the store was
-    created, on any machine.
-
-    Args:
-        folder: study's folder, locked by this process.
-        engine: engine that this machine would use.
-        overwrite: remove the results of other studies from the folder.
-
-    Raises:
-        InputError: the folder holds another study, or a store of another backend than the one that the engine requires.
-    """
-    results = claim_study(folder, engine.config, overwrite=overwrite)
-    if "sweep" in results.entries:
-        engine = _match_engine(Store(results), engine)
-    return engine, Store.create(results, engine)
-
-
-def _match_engine(store: Store, engine: Engine) -> Engine:
-    """Return an engine with a store's layout and backend."""
-    if engine.require_backend and store.backend != engine.backend and not store.manifest["finished"]:
-        raise InputError(
-            f"{store.folder}: was begun with --backend {store.backend}; go on with that, or choose another folder with --out"
-        )
-    if (store.layout, store.backend) == (engine.layout, engine.backend):
-        return engine
-    return Engine(engine.config, store.layout, engine.devices, store.backend, engine.require_backend)
-
-
 @contextmanager
-def join_store(folder: Path, engine: Engine) -> Iterator[tuple[Engine, Store]]:
+def join_store(folder: Path, engine: Engine) -> Iterator[Store]:
     """Open the store of a study whose parts several processes write; the first of them creates it.
 
-    Yields an engine with the store's layout and backend, and the store. Raises as :func:`open_or_create_store`.
+    Raises as :meth:`Store.create`.
     """
     while True:
         # where another process prepares the folder, this one waits
         with suppress(FolderInUse), lock_folder(folder):
-            open_or_create_store(folder, engine)
+            Store.create(folder, engine)
         with lock_folder(folder, shared=True, wait=_PREPARATION_SECONDS):
             # without the entry, the process that prepared the folder has been ended
             if "sweep" in claim_study(folder, engine.config).entries:
                 store = Store.open(folder)
-                yield _match_engine(store, engine), store
+                store.set_layout_of(engine)
+                yield store
                 return
-
-
-class RunTotals(NamedTuple):
-    """Totals of a run.
-
-    Attributes:
-        lanes: number of lanes that were computed.
-        compile_seconds: time of compilations, s.
-        run_seconds: time of computing, s.
-        fallback_reasons: what the fused loop does not support, of groups that the scan computed in its place.
-        damaged: a sentence for each damaged part.
-    """
-
-    lanes: int = 0
-    compile_seconds: float = 0.0
-    run_seconds: float = 0.0
-    fallback_reasons: tuple[str, ...] = ()
-    damaged: tuple[str, ...] = ()
-
-    def __add__(self, other: Any) -> "RunTotals":
-        totals = RunTotals(*map(operator.add, self, other))
-        return totals._replace(fallback_reasons=tuple(dict.fromkeys(totals.fallback_reasons)))
 
 
 class MemoryStore(dict[int, pd.DataFrame]):
     """Rows of chunks by index, in place of a :class:`jaxbl.sweeps.store.Store`, for a study without a folder."""
 
-    damaged = ()
     write_part = dict.__setitem__
 
     def read_part(self, index: int, columns: Sequence[str]) -> pd.DataFrame | None:
@@ -118,27 +64,16 @@ class StudyRun:
         engine: computes a chunk.
         store: stores the chunks, a :class:`jaxbl.sweeps.store.Store` or a :class:`MemoryStore`.
         progress: called with finished and total lanes.
-
-    Attributes:
-        worker_totals: totals of the workers of a cluster.
     """
 
     def __init__(self, engine: Engine, store: Any, progress: Progress | None = None):
         self.engine, self.store, self.progress = engine, store, progress
-        self.worker_totals = RunTotals()
-        self._lanes = self._done = self._next = 0
+        self._done = self._next = 0
         self._chunks, self._total = len(engine), engine.rows
-
-    @property
-    def totals(self) -> RunTotals:
-        """Totals of this process and of the workers."""
-        engine, damaged = self.engine, tuple(self.store.damaged)
-        totals = RunTotals(self._lanes, engine.compile_seconds, engine.run_seconds, tuple(engine.fallback_reasons), damaged)
-        return totals + self.worker_totals
 
     def compute_share(self, indices: Sequence[int]) -> None:
         """Compute the chunks with some indices, in their order; the progress is of these."""
-        self._chunks, self._total = len(indices), sum(self.engine.chunk(index).lanes for index in indices)
+        self._total = sum(self.engine.chunk(index).lanes for index in indices)
         self.compute_missing(map(self.engine.chunk, indices))
 
     def compute_all(self) -> None:
@@ -152,9 +87,10 @@ class StudyRun:
 
     def mark_finished(self) -> None:
         """Write into the manifest that all parts are stored."""
-        totals = self.totals
-        if totals.lanes or not self.store.manifest["finished"]:
-            self.store.update_manifest(finished=True, seconds={"compile": totals.compile_seconds, "run": totals.run_seconds})
+        cost = self.engine.cost
+        if cost["lanes"] or not self.store.manifest["finished"]:
+            seconds = {"compile": cost["compile_seconds"], "run": cost["run_seconds"]}
+            self.store.update_manifest(finished=True, seconds=seconds)
 
     def _refine(self, group: int) -> None:
         """Compute the coarse grid of a group, and the points that refine its boundaries."""
@@ -196,7 +132,6 @@ class StudyRun:
         with ThreadPoolExecutor(1) as writer:
             for chunk in self.missing_chunks(chunks):
                 frame = self.engine.run(chunk)
-                self._lanes += len(frame)
                 before, computed = computed, (chunk, writer.submit(self.store.write_part, chunk.index, frame))
                 # frames are large: at most one waits to be written
                 self._await_part(before)
@@ -228,10 +163,5 @@ class StudyRun:
     def count_chunk(self, chunk: Chunk) -> None:
         """Count the lanes of a chunk as done, and report progress."""
         self._done += chunk.lanes
-        self.report_progress()
-
-    def report_progress(self, parts: int = 0) -> None:
-        """Report the lanes that are done: those that were counted, or more if so many parts are stored."""
         if self.progress:
-            stored = parts * self._total // max(self._chunks, 1)
-            self.progress(min(max(self._done, stored), self._total), self._total)
+            self.progress(self._done, self._total)

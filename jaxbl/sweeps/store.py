@@ -139,10 +139,20 @@ class Store:
         self._copy_folder: Path | None = None
 
     @classmethod
-    def create(cls, results: ResultFolder, engine: "Engine") -> "Store":
-        """Open the store in a claimed folder, or create it. The engine has the layout and backend of parts that exist."""
-        folder, config, before = results.path, engine.config, results.entries.get("sweep", {})
-        text = config.to_toml()
+    def create(cls, folder: Path, engine: "Engine", *, overwrite: bool = False) -> "Store":
+        """Create the store of an engine's study in a locked folder (:func:`jaxbl.files.lock_folder`), or open it.
+
+        The engine gets the layout and backend of a store that exists: chunks keep the shape that they had when the store was
+        created, on any machine. With `overwrite`, results of other studies are removed from the folder.
+
+        Raises:
+            InputError: the folder holds another study, or a store of another backend than the engine requires.
+        """
+        config = engine.config
+        results = claim_study(folder, config, overwrite=overwrite)
+        before, text = results.entries.get("sweep", {}), config.to_toml()
+        if before:
+            cls(results).set_layout_of(engine)
         results.entries["sweep"] = {
             "layout": engine.layout._asdict(),
             "backend": engine.backend,
@@ -181,6 +191,15 @@ class Store:
         if _recover_study(folder) is not None:
             raise InputError(f"{folder}: {lost} {MANIFEST}; 'jaxbl repair {folder}' writes it anew from the parts")
         raise InputError(f"{folder}: holds no study (no {MANIFEST} of a sweep); run 'jaxbl sweep' first")
+
+    def set_layout_of(self, engine: "Engine") -> None:
+        """Have an engine compute chunks of the store's layout by its backend. Raises `InputError` if it requires another."""
+        if engine.require_backend and self.backend != engine.backend and not self.manifest["finished"]:
+            raise InputError(
+                f"{self.folder}: was begun with --backend {self.backend}; go on with that, or choose another folder with "
+                "--out"
+            )
+        engine.use_layout(self.layout, self.backend)
 
     @property
     def layout(self) -> Layout:

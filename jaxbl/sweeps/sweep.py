@@ -21,7 +21,7 @@ from .bundles import ClusterRun
 from .engine import Engine, SweepEstimate
 from .metrics import find_metric
 from .programs import Backend
-from .run import MemoryStore, StudyRun, join_store, open_or_create_store
+from .run import MemoryStore, StudyRun, join_store
 from .status import Status, status
 from .store import Store, load_config
 
@@ -189,48 +189,37 @@ def sweep(
             another study, the backend cannot run the study, or no cluster answers.
         NoResult: the disk is full, or the cluster is lost; parts that were written are whole.
     """
-    engine = _make_engine(study, backend, devices)
-    if out is None:
-        if scheduler is not None:
-            raise InputError("--scheduler: its workers write into a folder; name it with --out")
-        if backend == "fused":
-            engine.compile_all()
-        memory = MemoryStore()
-        run = StudyRun(engine, memory, progress)
-        run.compute_all()
-        return _make_result(run, memory.frame())
-    folder = to_path(out)
-    if backend == "fused" and not (folder / MANIFEST).exists():
+    engine = Engine(read_config(study), devices=devices, backend=backend)
+    if out is None and scheduler is not None:
+        raise InputError("--scheduler: its workers write into a folder; name it with --out")
+    folder = None if out is None else to_path(out)
+    if backend == "fused" and not (folder and (folder / MANIFEST).exists()):
         # a backend that cannot run the study is refused before anything is written
         engine.compile_all()
+    if folder is None:
+        memory = MemoryStore()
+        StudyRun(engine, memory, progress).compute_all()
+        return _make_result(engine, memory.frame())
     with connect(scheduler) as cluster:
         with lock_folder(folder, wait=0.0 if cluster is None else _RELEASE_SECONDS):
-            engine, store = open_or_create_store(folder, engine, overwrite=overwrite)
+            store = Store.create(folder, engine, overwrite=overwrite)
             store.list_indices()
             if cluster is None:
                 run = StudyRun(engine, store, progress)
                 run.compute_all()
                 run.mark_finished()
-            else:
-                run = ClusterRun(cluster, engine, store, progress)
         if cluster is not None:
+            run = ClusterRun(cluster, engine, store, progress)
             with lock_folder(folder, shared=True):
                 run.compute_all()
             # this removes drafts of workers that were lost, too
             with lock_folder(folder, wait=_RELEASE_SECONDS):
                 run.mark_finished()
-    return _make_result(run, store)
+    return _make_result(engine, store, store.damaged)
 
 
-def _make_engine(study: ConfigSource, backend: Backend | None, devices: list[Any] | None = None) -> Engine:
-    """Make the engine of a study; it requires the backend if one is chosen."""
-    return Engine(read_config(study), devices=devices, backend=backend, require_backend=backend is not None)
-
-
-def _make_result(run: StudyRun, source: Store | pd.DataFrame) -> StudyResult:
-    totals = run.totals
-    cost = {name: getattr(totals, name) for name in ("compile_seconds", "run_seconds", "lanes")}
-    return StudyResult(run.engine.config, source, cost, totals.fallback_reasons, totals.damaged)
+def _make_result(engine: Engine, source: Store | pd.DataFrame, damaged: Iterable[str] = ()) -> StudyResult:
+    return StudyResult(engine.config, source, engine.cost, tuple(engine.fallback_reasons), tuple(damaged))
 
 
 def share(
@@ -259,10 +248,10 @@ def share(
         InputError: as for :func:`sweep`; or the study is refined, so that its points depend on one another.
         NoResult: the disk is full.
     """
-    folder, engine = to_path(out), _make_engine(study, backend, devices)
+    folder, engine = to_path(out), Engine(read_config(study), devices=devices, backend=backend)
     _check_independent(engine, "--share")
     number, count = portion
-    with join_store(folder, engine) as (engine, store):
+    with join_store(folder, engine) as store:
         StudyRun(engine, store, progress).compute_share(engine.chunk_order()[number - 1 :: count])
     return status(folder)
 
@@ -283,12 +272,12 @@ def submit(
         InputError: as for :func:`sweep`; or the study is refined, so that its points depend on one another, or the cluster
             would end with this process.
     """
-    folder, engine = to_path(out), _make_engine(study, backend, devices)
+    folder, engine = to_path(out), Engine(read_config(study), devices=devices, backend=backend)
     _check_independent(engine, "--detach")
     with connect(scheduler) as cluster:
         if cluster is None or cluster.local:
             raise InputError("--detach: needs the --scheduler of a cluster that stays when this command has ended")
-        with join_store(folder, engine) as (engine, store):
+        with join_store(folder, engine) as store:
             ClusterRun(cluster, engine, store).submit_missing()
     return status(folder)
 
@@ -324,10 +313,10 @@ def repair(folder: str | Path) -> tuple[int, Store]:
         raise InputError(f"{folder}: holds no study (no study.toml); run 'jaxbl sweep STUDY.toml --out {folder}'")
     config = load_config(folder)
     with lock_folder(folder):
-        _, store = open_or_create_store(folder, Engine(config))
+        store = Store.create(folder, Engine(config))
         return store.verify(), store
 
 
 def dry_run(study: ConfigSource, *, backend: Backend | None = None) -> SweepEstimate:
     """Estimate time and memory of a study by a compilation and short runs; for a refined study, of its coarse grid."""
-    return _make_engine(study, backend).estimate()
+    return Engine(read_config(study), backend=backend).estimate()

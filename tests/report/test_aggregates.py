@@ -15,7 +15,7 @@ from jaxbl.report import aggregates
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.results import write_report
 from jaxbl.sweeps.engine import Engine
-from jaxbl.sweeps.run import open_or_create_store
+from jaxbl.sweeps.store import Store
 from jaxbl.sweeps.sweep import open_study
 
 NUMBERS = {
@@ -61,7 +61,8 @@ def store_result(folder, data, **columns):
     """A made-up study in parts."""
     result = make_result(data, **columns)
     folder.mkdir()
-    engine, store = open_or_create_store(folder, Engine(result.config, backend="scan"))
+    engine = Engine(result.config, backend="scan")
+    store = Store.create(folder, engine)
     keys = [axis.path for axis in result.config.axes] + ["seed"]
     for index in range(len(engine)):
         labels = pd.DataFrame(engine.row_labels(engine.chunk(index)))

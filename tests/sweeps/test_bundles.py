@@ -19,7 +19,7 @@ from jaxbl.config import read_config
 from jaxbl.errors import InputError, NoResult
 from jaxbl.files import FolderInUse, lock_folder
 from jaxbl.gains.stages import open_stages
-from jaxbl.sweeps.bundles import Bundle, _bundle_size, compute_bundle
+from jaxbl.sweeps.bundles import _bundle_size, compute_bundle
 from jaxbl.sweeps.status import status
 from jaxbl.sweeps.sweep import submit, sweep
 from jaxbl.workers import subscribe
@@ -140,7 +140,7 @@ def test_bad_input(tmp_path, client, monkeypatch):
         submit(refined, tmp_path / "a", client)
     assert not (tmp_path / "a").exists()
     with pytest.raises(InputError, match=r"nowhere: is not seen by worker .*; --out should name a folder that all machines"):
-        compute_bundle(Bundle(str(tmp_path / "nowhere"), "", False, (0,)))
+        compute_bundle(str(tmp_path / "nowhere"), "", False, ())
 
 
 def _raise_error(job):

@@ -10,8 +10,8 @@ from small_study import ALPHA, LAMBDA, NOISE, small_study
 import jaxbl.sweeps.costs as under_test
 from jaxbl.config import read_config
 from jaxbl.fused import program_cache
-from jaxbl.sweeps.costs import Cost, Costs, Operations, can_run_fused, count_operations, load_costs, measure_costs
-from jaxbl.sweeps.programs import BACKENDS, Layout
+from jaxbl.sweeps.costs import Cost, Costs, Operations, count_operations, load_costs, measure_costs
+from jaxbl.sweeps.programs import BACKENDS, Layout, can_run_fused
 
 MADE_UP_COSTS = Costs(Cost(4e-7, 3e-9, 2e-11, 3e-4), Cost(0.0, 5e-9, 7e-11, 2e-3), 1e6)
 

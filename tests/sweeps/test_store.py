@@ -466,8 +466,7 @@ def test_a_dataset_of_damaged_or_foreign_parts_is_refused(study_copy, tmp_path):
 
 def test_parts_are_in_order_beyond_five_digits(tmp_path, finished_study):
     engine = Engine(read_config(study()), backend="scan")
-    results = claim_study(tmp_path, engine.config)
-    store = Store.create(results, engine)
+    store = Store.create(tmp_path, engine)
     rows = next(finished_study[1].source.batches())
     for index in (99_999, 100_000, 2):
         store.write_part(index, rows.assign(seed=index))
