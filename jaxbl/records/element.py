@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -225,12 +226,12 @@ def fit_element(log: RigLog) -> Element | None:
         _add_terms(rig, _drop_terms(rig, _fit_model(rig, TERMS))),
     ]
     models.sort(key=lambda model: len(model.sizes) + len(model.shapes))
-    best = models[1] if _compute_gain(rig, *models) is not None else models[0]
+    best = models[1] if _compute_gain(*models) is not None else models[0]
     best = _drop_terms(rig, best)
     series = _drop_terms(rig, _fit_model(rig, _SERIES))
-    if "slip" in series.terms and series.sizes[0] > 0.0 and _compute_gain(rig, best, series) is not None:
+    if "slip" in series.terms and series.sizes[0] > 0.0 and _compute_gain(best, series) is not None:
         best = series
-    gains = {term: _compute_gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
+    gains = {term: _compute_gain(_fit_without(rig, best, term), best) or 0.0 for term in best.terms}
     return _make_element(log, rig, best, gains)
 
 
@@ -301,28 +302,36 @@ def _find_reversals(values: np.ndarray, least: float) -> list[int]:
 
 
 class Model(NamedTuple):
-    """A model on a log: its terms, shapes, and linear numbers, which are positive but for stiffness and offset."""
+    """A model that was fitted to a log.
+
+    Attributes:
+        terms: names of its terms.
+        shapes: nonlinear numbers by name.
+        sizes: linear numbers: stiffness, offset, and those of the terms, which are positive.
+        errors: mean square error on each block of the log with sizes fitted to all other blocks, shape (blocks,).
+    """
 
     terms: tuple[str, ...]
     shapes: dict[str, float]
     sizes: np.ndarray
+    errors: np.ndarray
 
 
 def _add_terms(rig: _Rig, best: Model) -> Model:
     """Add terms, as long as one of them lowers the error clearly."""
     while True:
-        models = {term: _fit_model(rig, (*best.terms, term), best) for term in TERMS if term not in best.terms}
+        models = {term: _fit_model(rig, (*best.terms, term), best.shapes) for term in TERMS if term not in best.terms}
         candidates = [
             (len(model.shapes), -gain, model)
             for term, model in models.items()
-            if term in model.terms and model.sizes[0] > 0.0 and (gain := _compute_gain(rig, best, model)) is not None
+            if term in model.terms and model.sizes[0] > 0.0 and (gain := _compute_gain(best, model)) is not None
         ]
         if not candidates:
             return best
         # of two that are equally good, the one with fewer numbers
         (*_, best), *further = sorted(candidates, key=lambda candidate: candidate[:2])
         for *_, model in further:
-            if _compute_gain(rig, best, model) is not None:
+            if _compute_gain(best, model) is not None:
                 best = model
 
 
@@ -332,21 +341,21 @@ def _drop_terms(rig: _Rig, model: Model) -> Model:
         sufficient_models = [
             reduced
             for term in model.terms
-            if (reduced := _fit_without(rig, model, term)).sizes[0] > 0.0 and _compute_gain(rig, reduced, model) is None
+            if (reduced := _fit_without(rig, model, term)).sizes[0] > 0.0 and _compute_gain(reduced, model) is None
         ]
         if not sufficient_models:
             return model
-        model = min(sufficient_models, key=lambda reduced: np.mean(_held_out_errors(rig, reduced)))
+        model = min(sufficient_models, key=lambda reduced: np.mean(reduced.errors))
 
 
 def _fit_without(rig: _Rig, model: Model, term: str) -> Model:
-    return _fit_model(rig, tuple(name for name in model.terms if name != term), model)
+    return _fit_model(rig, tuple(name for name in model.terms if name != term), model.shapes)
 
 
-def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> Model:
+def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Mapping[str, float] = MappingProxyType({})) -> Model:
     """Fit a model by least squares, without terms that then have a negative size.
 
-    The search starts at the shapes of `near`; other shapes start at the best of a grid.
+    The search starts at the shapes `near`; other shapes start at the best of a grid.
     """
     from scipy.optimize import least_squares
 
@@ -367,34 +376,29 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> 
         low, high = np.array([scale_shapes(name, _SHAPE_BOUNDS[name]) for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
-        near_shapes = {} if near is None else near.shapes
-        choices = ([near_shapes[name]] if name in near_shapes else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
+        choices = ([near[name]] if name in near else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
         starts = sorted(map(np.array, itertools.product(*choices)), key=lambda start: rms(compute_residual(start, few)))
         solutions = [search(start, args=(few,)) for start in starts[:3]]
         best = min(solutions, key=lambda solution: solution.cost)
         shapes = dict(zip(names, search(best.x, args=(rig,)).x.tolist(), strict=True))
-    columns = rig.compute_columns(terms, shapes)
+    columns, torque = rig.compute_columns(terms, shapes), rig.fitted_torque
     scale = column_rms(columns) + 1e-300
-    sizes = np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale
+    sizes = np.linalg.lstsq(columns / scale, torque, rcond=1e-10)[0] / scale
     size_by_term = dict(zip((term for term in terms if term in SIZE_NAMES), sizes[2:], strict=True))
     positive = tuple(term for term in terms if size_by_term.get(term, 1.0) > 0.0)
-    model = Model(terms, shapes, sizes)
-    return model if positive == terms else _fit_model(rig, positive, model)
-
-
-def _held_out_errors(rig: _Rig, model: Model) -> np.ndarray:
-    """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
-    columns, torque = rig.compute_columns(model.terms, model.shapes), rig.fitted_torque
+    if positive != terms:
+        return _fit_model(rig, positive, shapes)
     # rounding, for a log without noise
-    return BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * np.mean(torque**2)
+    errors = BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * np.mean(torque**2)
+    return Model(terms, shapes, sizes, errors)
 
 
-def _compute_gain(rig: _Rig, without: Model, model: Model) -> float | None:
+def _compute_gain(without: Model, model: Model) -> float | None:
     """Compute the squared error without a term over that with it, less 1, on left-out blocks; None if not clearly above 0.
 
     Logarithms are compared: a term may matter a hundred times as much in one block as in another.
     """
-    gains = np.log(_held_out_errors(rig, without) / _held_out_errors(rig, model))
+    gains = np.log(without.errors / model.errors)
     mean = np.mean(gains)
     return math.expm1(mean) if mean > _SURE_ERRORS * mean_error(gains) else None
 
