@@ -10,7 +10,7 @@ from jaxbl.validation import suggest_word
 from .files import LogFile
 from .libraries import ColumnName
 from .signal_quality import find_resolution, find_runs
-from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
+from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
 _LEAST_MOTION, _LEAST_TORQUE = 1e-12, 1e-15
@@ -90,14 +90,14 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         if is_similar and column not in used_columns:
             raise file.error(f"no column '{name}', but '{column}'; [log] {name} = \"{column}\" would read it")
     if table.kind == "drive":
-        file.notes.append(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
+        file.note(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
     return False
 
 
 def _read_numbers(
     file: LogFile,
     name: str,
-    table: PositionTable | SpeedTable | TorqueTable,
+    table: ChannelTable,
     stamps: TimeStamps,
     other_column: ColumnName | None = None,
 ) -> np.ndarray:
@@ -117,7 +117,7 @@ def _read_numbers(
     return signed_words
 
 
-def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+def decode_words(table: ChannelTable, values: np.ndarray) -> np.ndarray:
     """Return the numbers of a column, of which words with a sign become signed; NaN for a value that is no such word."""
     if table.sign_bit is not None:
         limit = 2.0**table.sign_bit
@@ -131,7 +131,7 @@ def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.nda
     return np.where(is_word, np.where(values >= limit, negative, values), np.nan)
 
 
-def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+def to_si(table: ChannelTable, values: np.ndarray) -> np.ndarray:
     """Convert signed and unwrapped numbers of a column to SI units by its `[log]` table: rad (m), rad/s (m/s), N m (N)."""
     factor = table.factor or 1.0
     if isinstance(table, SpeedTable):
@@ -191,7 +191,7 @@ def _integrate_speed(file: LogFile, name: str, channel: str, table: SpeedTable, 
     step = find_resolution(values)
     position = cumulative_trapezoid(to_si(table, values), stamps.times, initial=0.0)
     step_text = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
-    file.warnings.append(
+    file.warn(
         f"{name} is the integral of the speed {channel}{step_text}: its errors add up over time. Even a complete model "
         "may leave more than noise, and effects that depend on the load's position are found only roughly."
     )
@@ -206,7 +206,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     if table.signed_bits is None and table.sign_bit is None:
         _check_unsigned(file, name, column, values)
     if name == "u" and np.ptp(values) == 0.0:
-        file.notes.append(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")
+        file.note(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")
     values = _replace_dropouts(file, name, values, stamps)
     saturated = 0.0
     if table.saturation is not None:
@@ -256,7 +256,7 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
         kept_times, kept_values = np.delete(stamps.times, rows), np.delete(values, rows)
         values = values.copy()
         values[rows] = np.interp(stamps.times[rows], kept_times, kept_values)
-        file.warnings.append(
+        file.warn(
             f"{name} is {filler:g} in {len(rows)} samples between others that are far from it (data row "
             f"{stamps.rows[rows[0]] + 1} first): dropouts, which were left out."
         )
@@ -288,7 +288,7 @@ def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: floa
     if not 0 < len(rows) <= 0.01 * len(values):
         return values
     texts = [f"{jumps[row]:+.0f} (data row {stamps.rows[row + 1] + 1})" for row in rows[:6]]
-    file.warnings.append(
+    file.warn(
         f"{name}: {len(rows)} counter jump{'s' * (len(rows) > 1)}, in steps of {step:.4g}: {', '.join(texts)}"
         f"{', ...' * (len(rows) > 6)}. They were undone."
     )
@@ -309,7 +309,7 @@ def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) 
     unwrapped = np.unwrap(values, period=table.wrap)
     count = np.count_nonzero(np.abs(np.diff(unwrapped) - np.diff(values)) > 0.5 * table.wrap)
     if count:
-        file.notes.append(f"{name}: {count} wrap-arounds undone.")
+        file.note(f"{name}: {count} wrap-arounds undone.")
     return unwrapped
 
 

@@ -101,6 +101,14 @@ class LogFile:
         self.contradiction = ""
         self.date: int | None = None
 
+    def note(self, sentence: str) -> None:
+        """Add a sentence on a change to the log, or on its oddities."""
+        self.notes.append(sentence)
+
+    def warn(self, sentence: str) -> None:
+        """Add a sentence to be said first."""
+        self.warnings.append(sentence)
+
     def error(self, text: str) -> InputError:
         """Return the error to be raised for a fault of the file."""
         return InputError(f"{self.path}: {text}")
@@ -165,7 +173,7 @@ class LogFile:
             row = np.argmax(np.isnat(stamps)) + 1
             raise self.error(f"column {name!r}, data row {row} is no time, or empty")
         if stamps.dtype.kind == "M" and len(stamps):
-            self.notes.append(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
+            self.note(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
         # whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
         nanoseconds = stamps.astype(f"{stamps.dtype.kind}8[ns]").astype(np.int64)
         self.date = int(nanoseconds[0]) if len(stamps) else None
@@ -623,7 +631,7 @@ def _split_cells(line: str, separator: str) -> list[str]:
 
 
 def _check_names(cells: list[str]) -> list[str]:
-    if cells and not cells[-1]:
+    if not cells[-1]:
         cells = [*cells[:-1], f"column {len(cells) - 1}"]  # a separator at the end of the lines
     if len({*cells}) < len(cells):
         duplicate = next(cell for i, cell in enumerate(cells) if cell in cells[:i])

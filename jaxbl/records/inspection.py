@@ -354,7 +354,7 @@ def _judge_stiffness(record: Record, ratio: float, noise: float) -> _Judgement:
     if record.transmitted is None and (record.torque is None or np.ptp(record.torque) == 0.0):
         return "no", "no varying torque was recorded"
     if record.statistics.channels["theta_e"].bandwidth == 0.0:
-        return "no", "the motion does not exceed the noise"
+        return _HIDDEN
     slope, error, spread = fit_twist(record, ratio)
     if not np.isfinite(slope):
         return "weak", "the log is too short to see how the twist follows the torque"

@@ -24,7 +24,7 @@ from jaxbl.validation import LARGEST, open_regular_file
 from .channels import decode_words, to_si
 from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
-from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
+from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
 Block = tuple[Sequence[ColumnName], np.ndarray]
@@ -75,7 +75,7 @@ class Rows(NamedTuple):
     starts_segment: bool
 
 
-def _stream_signals(table: LogTable) -> dict[str, TorqueTable | PositionTable | SpeedTable]:
+def _stream_signals(table: LogTable) -> dict[str, ChannelTable]:
     """Return the tables of input, motor and load position by channel."""
     return {"u": table.u or TorqueTable()} | dict(map(table.position_source, POSITION_CHANNELS.values()))
 

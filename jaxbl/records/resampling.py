@@ -83,7 +83,7 @@ def resample_channels(
             raise file.error(f"{text}; a longer part is needed, or a shorter [log] resample")
         # channels may be resampled more than once
         if (note := f"Left out are {text}.") not in file.notes:
-            file.notes.append(note)
+            file.note(note)
     segments = slices_between(itertools.accumulate(map(len, times), initial=0))
     return Grid(np.concatenate(times), {name: np.concatenate(pieces) for name, pieces in values.items()}, segments, period)
 
