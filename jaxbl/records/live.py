@@ -594,12 +594,10 @@ class Datagrams(Source):
 
 
 def _parse_address(address: str) -> tuple[str, int]:
-    error = InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")
-    try:
+    # for a port that is no number, or an unfinished address
+    with suppress(ValueError):
         parts = urlsplit(address)
         host, port = parts.hostname, parts.port
-    except ValueError:
-        raise error from None
-    if parts.scheme != "udp" or not host or port is None or parts.path.strip("/") or parts.query:
-        raise error
-    return host, port
+        if parts.scheme == "udp" and host and port is not None and not (parts.path.strip("/") or parts.query):
+            return host, port
+    raise InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")
