@@ -24,10 +24,11 @@ from jaxbl.validation import LARGEST, open_regular_file
 from .channels import decode_words, to_si
 from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
+from .signal_quality import Array
 from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
-Block = tuple[Sequence[ColumnName], np.ndarray]
+Block = tuple[Sequence[ColumnName], Array]
 """Names of columns, and numbers, shape (rows, columns)."""
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 TOO_FAST = "datagrams that came faster than they could be taken in"
@@ -70,8 +71,8 @@ class Rows(NamedTuple):
     """
 
     time: float
-    torque: np.ndarray
-    positions: dict[str, np.ndarray]
+    torque: Array
+    positions: dict[str, Array]
     starts_segment: bool
 
 
@@ -123,7 +124,7 @@ class _ChannelReader:
         }
         self._last, self._ends, self._row = np.empty((4, 0)), np.zeros(3), 0
 
-    def decode(self, values: np.ndarray, period: float) -> tuple[np.ndarray, int]:
+    def decode(self, values: Array, period: float) -> tuple[Array, int]:
         """Decode values (rows, columns); `period` (s) is what stamps have to resolve.
 
         Returns:
@@ -150,7 +151,7 @@ class _ChannelReader:
         samples = samples[:, is_readable & (np.abs(samples) <= LARGEST).all(axis=0)]
         return samples, len(values) - samples.shape[1]
 
-    def steps(self, samples: np.ndarray) -> np.ndarray:
+    def steps(self, samples: Array) -> Array:
         """Return the steps between decoded samples, shape (4, samples - 1), those of wrapped positions the shorter way."""
         steps = np.diff(samples)
         for i, table in enumerate(self._signals.values(), 1):
@@ -158,7 +159,7 @@ class _ChannelReader:
                 steps[i] = (steps[i] + 0.5 * wrap) % wrap - 0.5 * wrap
         return steps
 
-    def convert(self, samples: np.ndarray) -> np.ndarray:
+    def convert(self, samples: Array) -> Array:
         """Convert decoded samples, shape (4, samples), to SI units, with the turns that they belong to."""
         from scipy.integrate import cumulative_trapezoid
 
@@ -238,7 +239,7 @@ class Stream:
         if number:
             self.counts[fault] += int(number)
 
-    def _leave_out_outliers(self, samples: np.ndarray) -> np.ndarray:
+    def _leave_out_outliers(self, samples: Array) -> Array:
         """Leave out single rows far from both neighbours, which would move the observers or the clock for long.
 
         A row at the end that is far from the one before is held until the next one has come.
@@ -266,7 +267,7 @@ class Stream:
         self._recent = np.concatenate([self._recent, new], axis=1)[:, -_RECENT_ROWS:]
         return new
 
-    def _check_period(self, stamps: np.ndarray) -> None:
+    def _check_period(self, stamps: Array) -> None:
         """Compare the period of the first rows with the expected one."""
         if len(self._first_stamps) >= _PERIOD_ROWS:
             return
@@ -288,7 +289,7 @@ class Stream:
             self.source.fault = f"; {fault}"
         self._is_period_right = fault is None
 
-    def _split_rows(self, samples: np.ndarray) -> list[Rows]:
+    def _split_rows(self, samples: Array) -> list[Rows]:
         """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
         stamps = samples[0]
         if self._is_period_right is False and len(self._first_stamps) >= _PERIOD_ROWS:
@@ -317,7 +318,7 @@ class Stream:
             returned = 0
         return rows
 
-    def _interpolate_lost(self, samples: np.ndarray, returned: int) -> Rows:
+    def _interpolate_lost(self, samples: Array, returned: int) -> Rows:
         """Return rows without a gap, with lost samples interpolated; stamps may jitter by less than half a period.
 
         The first of the samples was `returned` already (1), or a segment starts with it (0).

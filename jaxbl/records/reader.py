@@ -33,6 +33,7 @@ from .plausibility import (
 from .resampling import Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import (
+    Array,
     ChannelStatistics,
     count_jumps,
     find_bandwidth,
@@ -90,12 +91,12 @@ class Record:
     """
 
     path: Path
-    time: np.ndarray
+    time: Array
     sample_period: float
-    torque: np.ndarray | None
-    positions: dict[str, np.ndarray]
-    transmitted: np.ndarray | None
-    reference: np.ndarray | None
+    torque: Array | None
+    positions: dict[str, Array]
+    transmitted: Array | None
+    reference: Array | None
     closed_loop: bool | None
     start: float
     segments: tuple[slice, ...]
@@ -104,7 +105,7 @@ class Record:
     corrections: dict[str, float]
     contradiction: str
     statistics: LogStatistics
-    intervals: np.ndarray
+    intervals: Array
     logs: tuple[tuple[Path, slice], ...]
 
     def unit_of(self, path: str, unit: str) -> str:
@@ -506,7 +507,7 @@ def _require_channels(record: Record, names: Iterable[str], other: Record) -> No
         )
 
 
-def _list_channels(record: Record) -> dict[str, np.ndarray]:
+def _list_channels(record: Record) -> dict[str, Array]:
     channels = {f"{side} position": values for side, values in record.positions.items()}
     channels |= {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
     return {name: values for name, values in channels.items() if values is not None}
