@@ -14,6 +14,7 @@ from .gearing import Flanks, Gearing, find_flank
 from .least_squares import fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
+    Array,
     find_motion_bandwidth,
     interpolate_spline,
     long_segments,
@@ -169,9 +170,9 @@ class _Regression(NamedTuple):
         twist_range: of the twist without the wind-up, without a hundredth at each end, rad (m).
     """
 
-    values: np.ndarray
-    errors: np.ndarray
-    motion: Sequence[np.ndarray]
+    values: Array
+    errors: Array
+    motion: Sequence[Array]
     has_both_flanks: bool
     twist_range: float
 

@@ -9,8 +9,8 @@ from jaxbl.validation import suggest_word
 
 from .files import LogFile
 from .libraries import ColumnName
-from .signal_quality import find_resolution, find_runs
-from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TorqueTable
+from .signal_quality import Array, find_resolution, find_runs
+from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
 _LEAST_MOTION, _LEAST_TORQUE = 1e-12, 1e-15
@@ -29,14 +29,14 @@ class RawChannel(NamedTuple):
         drift: growth of the skew, s/s.
     """
 
-    values: np.ndarray
+    values: Array
     unit: str
     skew: float
     saturated: float = 0.0
     hold: Literal["zoh", "sampled"] | None = None
     drift: float = 0.0
 
-    def undo_delay(self, stamps: np.ndarray) -> np.ndarray:
+    def undo_delay(self, stamps: Array) -> Array:
         """Return the times of readings with these stamps, s."""
         return stamps - (self.skew + self.drift * stamps)
 
@@ -90,17 +90,17 @@ def _is_recorded(file: LogFile, table: LogTable, name: str) -> bool:
         if is_similar and column not in used_columns:
             raise file.error(f"no column '{name}', but '{column}'; [log] {name} = \"{column}\" would read it")
     if table.kind == "drive":
-        file.notes.append(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
+        file.note(f"There is no {name} ({'motor' if name == 'theta_e' else 'load'} position) in this log.")
     return False
 
 
 def _read_numbers(
     file: LogFile,
     name: str,
-    table: PositionTable | SpeedTable | TorqueTable,
+    table: ChannelTable,
     stamps: TimeStamps,
     other_column: ColumnName | None = None,
-) -> np.ndarray:
+) -> Array:
     """Read the numbers of a channel's column, or of another one, at the selected rows; words become signed numbers."""
     column = table.column_or(name) if other_column is None else other_column
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
@@ -117,7 +117,7 @@ def _read_numbers(
     return signed_words
 
 
-def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+def decode_words(table: ChannelTable, values: Array) -> Array:
     """Return the numbers of a column, of which words with a sign become signed; NaN for a value that is no such word."""
     if table.sign_bit is not None:
         limit = 2.0**table.sign_bit
@@ -131,7 +131,7 @@ def decode_words(table: PositionTable | SpeedTable | TorqueTable, values: np.nda
     return np.where(is_word, np.where(values >= limit, negative, values), np.nan)
 
 
-def to_si(table: PositionTable | SpeedTable | TorqueTable, values: np.ndarray) -> np.ndarray:
+def to_si(table: ChannelTable, values: Array) -> Array:
     """Convert signed and unwrapped numbers of a column to SI units by its `[log]` table: rad (m), rad/s (m/s), N m (N)."""
     factor = table.factor or 1.0
     if isinstance(table, SpeedTable):
@@ -191,7 +191,7 @@ def _integrate_speed(file: LogFile, name: str, channel: str, table: SpeedTable, 
     step = find_resolution(values)
     position = cumulative_trapezoid(to_si(table, values), stamps.times, initial=0.0)
     step_text = f" in steps of {step * table.factor:.3g} {table.unit}" if step else ""
-    file.warnings.append(
+    file.warn(
         f"{name} is the integral of the speed {channel}{step_text}: its errors add up over time. Even a complete model "
         "may leave more than noise, and effects that depend on the load's position are found only roughly."
     )
@@ -206,7 +206,7 @@ def _read_torque(file: LogFile, name: str, table: TorqueTable, stamps: TimeStamp
     if table.signed_bits is None and table.sign_bit is None:
         _check_unsigned(file, name, column, values)
     if name == "u" and np.ptp(values) == 0.0:
-        file.notes.append(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")
+        file.note(f"u is {values[0]:g} in all rows: free motion, which does not show the inertia by itself.")
     values = _replace_dropouts(file, name, values, stamps)
     saturated = 0.0
     if table.saturation is not None:
@@ -234,7 +234,7 @@ _CLEAR_JUMP = 5.0
 """Size of a dropout or a jump, over what the samples beside it differ by: more than any smooth signal makes."""
 
 
-def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: TimeStamps) -> np.ndarray:
+def _replace_dropouts(file: LogFile, name: str, values: Array, stamps: TimeStamps) -> Array:
     """Replace single samples that return to one value again and again, as of a bus that did not answer.
 
     The value is 0, or the least or largest. Two samples on each side of a dropout lie on a line that is far from it.
@@ -256,7 +256,7 @@ def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: Time
         kept_times, kept_values = np.delete(stamps.times, rows), np.delete(values, rows)
         values = values.copy()
         values[rows] = np.interp(stamps.times[rows], kept_times, kept_values)
-        file.warnings.append(
+        file.warn(
             f"{name} is {filler:g} in {len(rows)} samples between others that are far from it (data row "
             f"{stamps.rows[rows[0]] + 1} first): dropouts, which were left out."
         )
@@ -269,7 +269,7 @@ _MAX_TOLERANCE = 0.02
 """Uncertainty of a jump, over its size, by the motion about it: a jump of any size meets a power of two in 1 of 25 cases."""
 
 
-def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: float, stamps: TimeStamps) -> np.ndarray:
+def _undo_counter_jumps(file: LogFile, name: str, values: Array, step: float, stamps: TimeStamps) -> Array:
     """Undo jumps of a position by a power of two of its steps, between which it goes on as before."""
     from scipy.ndimage import median_filter
 
@@ -288,7 +288,7 @@ def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: floa
     if not 0 < len(rows) <= 0.01 * len(values):
         return values
     texts = [f"{jumps[row]:+.0f} (data row {stamps.rows[row + 1] + 1})" for row in rows[:6]]
-    file.warnings.append(
+    file.warn(
         f"{name}: {len(rows)} counter jump{'s' * (len(rows) > 1)}, in steps of {step:.4g}: {', '.join(texts)}"
         f"{', ...' * (len(rows) > 6)}. They were undone."
     )
@@ -298,7 +298,7 @@ def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: floa
 # wrap-around
 
 
-def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
+def _unwrap(file: LogFile, name: str, table: PositionTable, values: Array) -> Array:
     if table.wrap is None:
         return values
     if np.ptp(values) > 1.001 * table.wrap:
@@ -309,11 +309,11 @@ def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) 
     unwrapped = np.unwrap(values, period=table.wrap)
     count = np.count_nonzero(np.abs(np.diff(unwrapped) - np.diff(values)) > 0.5 * table.wrap)
     if count:
-        file.notes.append(f"{name}: {count} wrap-arounds undone.")
+        file.note(f"{name}: {count} wrap-arounds undone.")
     return unwrapped
 
 
-def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray, stamps: TimeStamps) -> None:
+def _check_wrap(file: LogFile, name: str, table: PositionTable, values: Array, stamps: TimeStamps) -> None:
     """Refuse values that are smooth but for a few jumps by a common period (a turn, or a counter's range)."""
     steps = np.abs(np.diff(values))
     span = np.ptp(values)
@@ -340,7 +340,7 @@ def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarr
 # units
 
 
-def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: np.ndarray) -> None:
+def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: Array) -> None:
     """Refuse whole numbers from 0 up without any in the middle of a word's range: negative words, logged as unsigned."""
     if values.min() < 0.0 or (values != np.round(values)).any():
         return
@@ -355,7 +355,7 @@ def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: np.nda
             )
 
 
-def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> None:
+def _check_unit(file: LogFile, name: str, table: PositionTable, values: Array) -> None:
     """Refuse radians with the step of an encoder in degrees, degrees with one in radians, and counts as radians."""
     step = find_resolution(values)
     if table.factor != 1.0 or table.unit not in ("rad", "deg") or not step:

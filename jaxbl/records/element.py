@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
 from .least_squares import BlockRegression, column_rms, fit_residual, fit_with_jackknife, mean_error, rms, student_interval
-from .signal_quality import MIN_SAMPLES, count_samples, find_motion_bandwidth, low_pass, slices_between
+from .signal_quality import MIN_SAMPLES, Array, count_samples, find_motion_bandwidth, low_pass, slices_between
 
 _MAX_SAMPLES = 20_000
 """Samples that are fitted; of longer logs, means. A few hundred describe a loop of torque over displacement."""
@@ -92,7 +93,7 @@ class Element:
     numbers: dict[str, Quantity]
     open: tuple[str, ...]
     gains: dict[str, float]
-    torque: np.ndarray
+    torque: Array
     residual: float
     share: float
     reversals: int
@@ -121,8 +122,8 @@ class RigLog(NamedTuple):
         unit: of the displacement, rad or m.
     """
 
-    position: np.ndarray
-    torque: np.ndarray
+    position: Array
+    torque: Array
     segments: Sequence[slice]
     period: float
     noise: float
@@ -143,23 +144,23 @@ class _Rig:
         torque: N m (N), shape (samples,).
     """
 
-    position: np.ndarray
-    rate: np.ndarray
-    blur: np.ndarray
-    direction: np.ndarray
+    position: Array
+    rate: Array
+    blur: Array
+    direction: Array
     stretches: list[tuple[slice, bool]]
-    rows: np.ndarray
-    torque: np.ndarray
+    rows: Array
+    torque: Array
 
     @property
     def half_range(self) -> float:
         return 0.5 * float(np.ptp(self.position))
 
     @property
-    def fitted_torque(self) -> np.ndarray:
+    def fitted_torque(self) -> Array:
         return self.torque[self.rows]
 
-    def compute_torque(self, model: "Model") -> np.ndarray:
+    def compute_torque(self, model: "Model") -> Array:
         """Return the torque of a model, N m (N), shape (rows,)."""
         return self.compute_columns(model.terms, model.shapes) @ model.sizes
 
@@ -168,7 +169,7 @@ class _Rig:
         error = rms(self.fitted_torque - self.compute_torque(model))
         return error, error / float(np.std(self.fitted_torque))
 
-    def compute_columns(self, terms: Sequence[str], shapes: Mapping[str, float]) -> np.ndarray:
+    def compute_columns(self, terms: Sequence[str], shapes: Mapping[str, float]) -> Array:
         """Return the torque per unit of stiffness, offset, and sizes of terms in order; shape (rows, linear numbers)."""
         x = self.position - shapes.get("centre", 0.0)
         b = shapes.get("half_gap", 0.0)
@@ -187,7 +188,7 @@ class _Rig:
         columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
         return np.stack([column[self.rows] for column in columns], axis=1)
 
-    def _drag(self, reach: float) -> np.ndarray:
+    def _drag(self, reach: float) -> Array:
         """Return where the position has dragged what follows it at a distance of at most `reach`, shape (samples,)."""
         dragged, last = np.zeros(len(self.position)), 0.0
         for part, begins in self.stretches:
@@ -199,7 +200,7 @@ class _Rig:
             last = dragged[part.stop - 1]
         return dragged
 
-    def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
+    def _compute_hysteresis(self, deflection: Array, length: float) -> Array:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
         h, last = np.zeros(len(deflection)), 0.0
         for part, begins in self.stretches:
@@ -225,12 +226,12 @@ def fit_element(log: RigLog) -> Element | None:
         _add_terms(rig, _drop_terms(rig, _fit_model(rig, TERMS))),
     ]
     models.sort(key=lambda model: len(model.sizes) + len(model.shapes))
-    best = models[1] if _compute_gain(rig, *models) is not None else models[0]
+    best = models[1] if _compute_gain(*models) is not None else models[0]
     best = _drop_terms(rig, best)
     series = _drop_terms(rig, _fit_model(rig, _SERIES))
-    if "slip" in series.terms and series.sizes[0] > 0.0 and _compute_gain(rig, best, series) is not None:
+    if "slip" in series.terms and series.sizes[0] > 0.0 and _compute_gain(best, series) is not None:
         best = series
-    gains = {term: _compute_gain(rig, _fit_without(rig, best, term), best) or 0.0 for term in best.terms}
+    gains = {term: _compute_gain(_fit_without(rig, best, term), best) or 0.0 for term in best.terms}
     return _make_element(log, rig, best, gains)
 
 
@@ -281,7 +282,7 @@ def _prepare_rig(log: RigLog) -> _Rig | None:
     return _Rig(position, rate, blur, direction, stretches, rows, torque)
 
 
-def _find_reversals(values: np.ndarray, least: float) -> list[int]:
+def _find_reversals(values: Array, least: float) -> list[int]:
     """Return the indices of the extremes at which a signal turns back by more than `least`."""
     slope = np.sign(np.diff(values))
     moving = np.flatnonzero(slope)
@@ -301,28 +302,36 @@ def _find_reversals(values: np.ndarray, least: float) -> list[int]:
 
 
 class Model(NamedTuple):
-    """A model on a log: its terms, shapes, and linear numbers, which are positive but for stiffness and offset."""
+    """A model that was fitted to a log.
+
+    Attributes:
+        terms: names of its terms.
+        shapes: nonlinear numbers by name.
+        sizes: linear numbers: stiffness, offset, and those of the terms, which are positive.
+        errors: mean square error on each block of the log with sizes fitted to all other blocks, shape (blocks,).
+    """
 
     terms: tuple[str, ...]
     shapes: dict[str, float]
-    sizes: np.ndarray
+    sizes: Array
+    errors: Array
 
 
 def _add_terms(rig: _Rig, best: Model) -> Model:
     """Add terms, as long as one of them lowers the error clearly."""
     while True:
-        models = {term: _fit_model(rig, (*best.terms, term), best) for term in TERMS if term not in best.terms}
+        models = {term: _fit_model(rig, (*best.terms, term), best.shapes) for term in TERMS if term not in best.terms}
         candidates = [
             (len(model.shapes), -gain, model)
             for term, model in models.items()
-            if term in model.terms and model.sizes[0] > 0.0 and (gain := _compute_gain(rig, best, model)) is not None
+            if term in model.terms and model.sizes[0] > 0.0 and (gain := _compute_gain(best, model)) is not None
         ]
         if not candidates:
             return best
         # of two that are equally good, the one with fewer numbers
         (*_, best), *further = sorted(candidates, key=lambda candidate: candidate[:2])
         for *_, model in further:
-            if _compute_gain(rig, best, model) is not None:
+            if _compute_gain(best, model) is not None:
                 best = model
 
 
@@ -332,21 +341,21 @@ def _drop_terms(rig: _Rig, model: Model) -> Model:
         sufficient_models = [
             reduced
             for term in model.terms
-            if (reduced := _fit_without(rig, model, term)).sizes[0] > 0.0 and _compute_gain(rig, reduced, model) is None
+            if (reduced := _fit_without(rig, model, term)).sizes[0] > 0.0 and _compute_gain(reduced, model) is None
         ]
         if not sufficient_models:
             return model
-        model = min(sufficient_models, key=lambda reduced: np.mean(_held_out_errors(rig, reduced)))
+        model = min(sufficient_models, key=lambda reduced: np.mean(reduced.errors))
 
 
 def _fit_without(rig: _Rig, model: Model, term: str) -> Model:
-    return _fit_model(rig, tuple(name for name in model.terms if name != term), model)
+    return _fit_model(rig, tuple(name for name in model.terms if name != term), model.shapes)
 
 
-def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> Model:
+def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Mapping[str, float] = MappingProxyType({})) -> Model:
     """Fit a model by least squares, without terms that then have a negative size.
 
-    The search starts at the shapes of `near`; other shapes start at the best of a grid.
+    The search starts at the shapes `near`; other shapes start at the best of a grid.
     """
     from scipy.optimize import least_squares
 
@@ -359,7 +368,7 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> 
     def scale_shapes(name: str, shares: tuple[float, ...]) -> list[float]:
         return [half * share + (middle if name == "centre" else 0.0) for share in shares]
 
-    def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
+    def compute_residual(shapes: Array, rig: _Rig) -> Array:
         return fit_residual(rig.fitted_torque, rig.compute_columns(terms, dict(zip(names, shapes, strict=True))))
 
     shapes: dict[str, float] = {}
@@ -367,34 +376,29 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Model | None = None) -> 
         low, high = np.array([scale_shapes(name, _SHAPE_BOUNDS[name]) for name in names]).T
         search = partial(least_squares, compute_residual, bounds=(low, high), x_scale=half, diff_step=1e-4)
         few = replace(rig, rows=rig.rows[:: max(len(rig.rows) // _START_SAMPLES, 1)])
-        near_shapes = {} if near is None else near.shapes
-        choices = ([near_shapes[name]] if name in near_shapes else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
+        choices = ([near[name]] if name in near else scale_shapes(name, _SHAPE_STARTS[name]) for name in names)
         starts = sorted(map(np.array, itertools.product(*choices)), key=lambda start: rms(compute_residual(start, few)))
         solutions = [search(start, args=(few,)) for start in starts[:3]]
         best = min(solutions, key=lambda solution: solution.cost)
         shapes = dict(zip(names, search(best.x, args=(rig,)).x.tolist(), strict=True))
-    columns = rig.compute_columns(terms, shapes)
+    columns, torque = rig.compute_columns(terms, shapes), rig.fitted_torque
     scale = column_rms(columns) + 1e-300
-    sizes = np.linalg.lstsq(columns / scale, rig.fitted_torque, rcond=1e-10)[0] / scale
+    sizes = np.linalg.lstsq(columns / scale, torque, rcond=1e-10)[0] / scale
     size_by_term = dict(zip((term for term in terms if term in SIZE_NAMES), sizes[2:], strict=True))
     positive = tuple(term for term in terms if size_by_term.get(term, 1.0) > 0.0)
-    model = Model(terms, shapes, sizes)
-    return model if positive == terms else _fit_model(rig, positive, model)
-
-
-def _held_out_errors(rig: _Rig, model: Model) -> np.ndarray:
-    """Return the mean square error on each block of the log with sizes fitted to all other blocks; shape (blocks,)."""
-    columns, torque = rig.compute_columns(model.terms, model.shapes), rig.fitted_torque
+    if positive != terms:
+        return _fit_model(rig, positive, shapes)
     # rounding, for a log without noise
-    return BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * np.mean(torque**2)
+    errors = BlockRegression.of(torque, columns, _FOLDS).held_out() + 1e-14 * np.mean(torque**2)
+    return Model(terms, shapes, sizes, errors)
 
 
-def _compute_gain(rig: _Rig, without: Model, model: Model) -> float | None:
+def _compute_gain(without: Model, model: Model) -> float | None:
     """Compute the squared error without a term over that with it, less 1, on left-out blocks; None if not clearly above 0.
 
     Logarithms are compared: a term may matter a hundred times as much in one block as in another.
     """
-    gains = np.log(_held_out_errors(rig, without) / _held_out_errors(rig, model))
+    gains = np.log(without.errors / model.errors)
     mean = np.mean(gains)
     return math.expm1(mean) if mean > _SURE_ERRORS * mean_error(gains) else None
 

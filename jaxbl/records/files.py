@@ -41,6 +41,7 @@ from .libraries import (
     read_mdf,
     read_tdms,
 )
+from .signal_quality import Array
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
 _SUFFIXES = (
@@ -101,6 +102,14 @@ class LogFile:
         self.contradiction = ""
         self.date: int | None = None
 
+    def note(self, sentence: str) -> None:
+        """Add a sentence on a change to the log, or on its oddities."""
+        self.notes.append(sentence)
+
+    def warn(self, sentence: str) -> None:
+        """Add a sentence to be said first."""
+        self.warnings.append(sentence)
+
     def error(self, text: str) -> InputError:
         """Return the error to be raised for a fault of the file."""
         return InputError(f"{self.path}: {text}")
@@ -137,13 +146,13 @@ class LogFile:
         check_cost(f"{self.path}: column {name!r} of {count} values", _VALUE_BYTES * count, "cut the log into parts")
         return count
 
-    def load_values(self, name: ColumnName) -> np.ndarray:
+    def load_values(self, name: ColumnName) -> Array:
         """Load a column as it is in the file, shape (rows,); InputError if it is too long or cannot be read."""
         self.count_values(name)
         with name_file_in_errors(self.path), _report_errors(f"column {name!r}"):
             return np.asarray(self.columns[name])
 
-    def load_seconds(self, column: ColumnName, unit: float, channel: str = "") -> np.ndarray:
+    def load_seconds(self, column: ColumnName, unit: float, channel: str = "") -> Array:
         """Load a column of time stamps, s, shape (rows,); dates are counted from the first one.
 
         `unit` is the unit of stamps that are numbers, s. Errors are those of :meth:`load_numbers`.
@@ -165,13 +174,13 @@ class LogFile:
             row = np.argmax(np.isnat(stamps)) + 1
             raise self.error(f"column {name!r}, data row {row} is no time, or empty")
         if stamps.dtype.kind == "M" and len(stamps):
-            self.notes.append(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
+            self.note(f"Time is counted from {np.datetime_as_string(stamps[0])}.")
         # whole nanoseconds: seconds since 1970 are rounded to tenths of a microsecond
         nanoseconds = stamps.astype(f"{stamps.dtype.kind}8[ns]").astype(np.int64)
         self.date = int(nanoseconds[0]) if len(stamps) else None
         return 1e-9 * (nanoseconds - nanoseconds[:1])
 
-    def load_numbers(self, column: ColumnName, channel: str = "", rows: np.ndarray | None = None) -> np.ndarray:
+    def load_numbers(self, column: ColumnName, channel: str = "", rows: Array | None = None) -> Array:
         """Load a column of finite numbers, or some `rows` of it, shape (rows,).
 
         Raises:
@@ -347,7 +356,7 @@ def _read_parquet(path: Path, _: Selection) -> Columns:
     with path.open("rb") as opened, ParquetFile(opened) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
 
-    def load_column(name: str) -> np.ndarray:
+    def load_column(name: str) -> Array:
         with path.open("rb") as opened:
             values = pd.read_parquet(opened, columns=[name])[name]
         if isinstance(values.dtype, pd.DatetimeTZDtype):
@@ -382,7 +391,7 @@ def _read_table(path: Path, lines: list[str], encoding: str, selection: Selectio
     """
     text_format, headers = detect_text_format(lines), list[int]()
 
-    def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:
+    def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, Array], int]:
         """Return the names of all columns, the values of the selected ones, and the number of rows."""
         chunks: Any = pd.read_csv(
             path,
@@ -400,7 +409,7 @@ def _read_table(path: Path, lines: list[str], encoding: str, selection: Selectio
             compression=None,
             chunksize=_CHUNK_ROWS,
         )
-        pieces: dict[ColumnName, list[np.ndarray]] = {}
+        pieces: dict[ColumnName, list[Array]] = {}
         names: list[ColumnName] = []
         count = 0
         with chunks:
@@ -587,7 +596,7 @@ def _is_number_row(line: str) -> bool:
     return len(cells) > 1 and all(map(_VALUE.fullmatch, cells))
 
 
-def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) -> Columns:
+def _name_columns(values: list[Array], names: list[str], units: list[str]) -> Columns:
     """Name the columns, and interpolate those that have their own times to the times of the first one."""
     columns, times = Columns(), values[0]
     own_times = times
@@ -623,7 +632,7 @@ def _split_cells(line: str, separator: str) -> list[str]:
 
 
 def _check_names(cells: list[str]) -> list[str]:
-    if cells and not cells[-1]:
+    if not cells[-1]:
         cells = [*cells[:-1], f"column {len(cells) - 1}"]  # a separator at the end of the lines
     if len({*cells}) < len(cells):
         duplicate = next(cell for i, cell in enumerate(cells) if cell in cells[:i])
@@ -763,7 +772,7 @@ def _read_hdf5(path: Path, _: Selection) -> Columns:
     columns = Columns()
     referring_nodes: set[Any] = set()
 
-    def load_dataset(place: str) -> np.ndarray:
+    def load_dataset(place: str) -> Array:
         with h5py.File(path) as file:
             return np.asarray(file[place])
 

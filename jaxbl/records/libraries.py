@@ -19,6 +19,8 @@ import pandas as pd
 
 from jaxbl.errors import InputError
 
+from .signal_quality import Array
+
 ColumnName = str | int
 """Name of a column, or its number, counted from 0."""
 Selection = Collection[ColumnName]
@@ -60,11 +62,11 @@ class Column:
     def __len__(self) -> int:
         return self.rows
 
-    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Array:
         return np.asarray(self.load(), dtype=dtype)
 
 
-def read_at(times: np.ndarray, own_times: np.ndarray, values: Any) -> np.ndarray:
+def read_at(times: Array, own_times: Array, values: Any) -> Array:
     """Return values at the times of a log, interpolated from times of their own; NaN, no value, outside of these."""
     if np.array_equal(own_times, times, equal_nan=True):
         return np.asarray(values)
@@ -86,7 +88,7 @@ def read_tdms(path: Path, _: Selection) -> Columns:
     channels = [channel for group in library.TdmsFile.read_metadata(path).groups() for channel in group.channels()]
     names = [channel.name for channel in channels]
 
-    def load_channel(group: str, name: str) -> np.ndarray:
+    def load_channel(group: str, name: str) -> Array:
         with library.TdmsFile.open(path) as file:
             return file[group][name][:]
 
@@ -112,7 +114,7 @@ def read_mdf(path: Path, _: Selection) -> Columns:
     longest = max(groups, key=lambda i: file.groups[i].channel_group.cycles_nr)
     times = np.asarray(file.get_master(longest))
 
-    def load_channel(name: str, group: int, index: int) -> np.ndarray:
+    def load_channel(name: str, group: int, index: int) -> Array:
         signal = file.get(name, group=group, index=index)
         return read_at(times, signal.timestamps, signal.samples)
 
@@ -215,8 +217,8 @@ def _recording_columns(
 
     `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of a topic.
     """
-    loaded_values: dict[ColumnName, np.ndarray] = {}
-    times: dict[str, np.ndarray] = {}
+    loaded_values: dict[ColumnName, Array] = {}
+    times: dict[str, Array] = {}
 
     def load_topic(topic: str, names: list[ColumnName]) -> dict[str, None]:
         """Load the times and some columns of a topic; return the names of all its columns."""
@@ -249,12 +251,12 @@ def _recording_columns(
         raise InputError("holds no messages with numbers; a log needs them")
     main = max(selected_topics or places.values(), key=lambda topic: counts[topic])
 
-    def load_seconds(topic: str) -> np.ndarray:
+    def load_seconds(topic: str) -> Array:
         for needed_topic in {main, topic} - {*times}:
             load_topic(needed_topic, [])
         return 1e-9 * (times[topic] - times[main][0])
 
-    def load_column(topic: str, name: str) -> np.ndarray:
+    def load_column(topic: str, name: str) -> Array:
         if name not in loaded_values:
             load_topic(topic, [name])
         values = loaded_values[name]

@@ -24,10 +24,11 @@ from jaxbl.validation import LARGEST, open_regular_file
 from .channels import decode_words, to_si
 from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
-from .table import POSITION_CHANNELS, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
+from .signal_quality import Array
+from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
-Block = tuple[Sequence[ColumnName], np.ndarray]
+Block = tuple[Sequence[ColumnName], Array]
 """Names of columns, and numbers, shape (rows, columns)."""
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 TOO_FAST = "datagrams that came faster than they could be taken in"
@@ -70,12 +71,12 @@ class Rows(NamedTuple):
     """
 
     time: float
-    torque: np.ndarray
-    positions: dict[str, np.ndarray]
+    torque: Array
+    positions: dict[str, Array]
     starts_segment: bool
 
 
-def _stream_signals(table: LogTable) -> dict[str, TorqueTable | PositionTable | SpeedTable]:
+def _stream_signals(table: LogTable) -> dict[str, ChannelTable]:
     """Return the tables of input, motor and load position by channel."""
     return {"u": table.u or TorqueTable()} | dict(map(table.position_source, POSITION_CHANNELS.values()))
 
@@ -110,80 +111,11 @@ def check_stream_table(table: LogTable, name: str) -> None:
         raise InputError(f"{name}: [log] {keys[0]} is for whole logs; remove it to read rows that arrive one at a time")
 
 
-class _ChannelReader:
-    """Converts rows of columns to SI units; it remembers the turns of wrapped positions, and the integrals of speeds."""
-
-    def __init__(self, table: LogTable, name: str, columns: Sequence[ColumnName]):
-        self._table = table
-        self._clock, self._signals = table.t or TimeTable(), _stream_signals(table)
-        file = LogFile(Path(name), Columns(dict.fromkeys(columns, ())))
-        keys = {source.column_or(channel): channel for channel, source in [("t", self._clock), *self._signals.items()]}
-        self._indices = {
-            column: list(columns).index(file.find_column(column, keys.get(column, ""))) for column in stream_columns(table)
-        }
-        self._last, self._ends, self._row = np.empty((4, 0)), np.zeros(3), 0
-
-    def decode(self, values: np.ndarray, period: float) -> tuple[np.ndarray, int]:
-        """Decode values (rows, columns); `period` (s) is what stamps have to resolve.
-
-        Returns:
-            Stamps (s), torque, motor and load as they were sent, shape (4, samples). Number of rows that were unreadable.
-        """
-        # the same as pandas' comparison of a column with a number, true or false
-        for column, required in (self._table.where or {}).items():
-            values = values[values[:, self._indices[column]] == required]
-        columns = {column: values[:, index] for column, index in self._indices.items()}
-        if self._clock.period is not None:
-            stamps = (self._row + np.arange(len(values))) * self._clock.period
-            self._row += len(values)
-        else:
-            stamps = columns[self._clock.column_or("t")] * SECONDS_PER_UNIT[self._clock.unit]
-        signals, is_readable = [stamps], np.abs(stamps) * np.finfo(float).eps < 0.5 * period
-        for channel, table in self._signals.items():
-            numbers = decode_words(table, columns[table.column_or(channel)])
-            if (minus := getattr(table, "minus", None)) is not None:
-                numbers = numbers - decode_words(table, columns[minus])
-            elif wrap := getattr(table, "wrap", None):
-                is_readable &= np.abs(numbers) <= 2.0 * wrap
-            signals.append(numbers)
-        samples = np.stack(signals)
-        samples = samples[:, is_readable & (np.abs(samples) <= LARGEST).all(axis=0)]
-        return samples, len(values) - samples.shape[1]
-
-    def steps(self, samples: np.ndarray) -> np.ndarray:
-        """Return the steps between decoded samples, shape (4, samples - 1), those of wrapped positions the shorter way."""
-        steps = np.diff(samples)
-        for i, table in enumerate(self._signals.values(), 1):
-            if wrap := getattr(table, "wrap", None):
-                steps[i] = (steps[i] + 0.5 * wrap) % wrap - 0.5 * wrap
-        return steps
-
-    def convert(self, samples: np.ndarray) -> np.ndarray:
-        """Convert decoded samples, shape (4, samples), to SI units, with the turns that they belong to."""
-        from scipy.integrate import cumulative_trapezoid
-
-        if not samples.shape[1]:
-            return samples
-        # from the sample before on, if there is one
-        numbers, before = np.concatenate([self._last, samples], axis=1), self._last.shape[1]
-        self._last, signals = samples[:, -1:], [samples[0]]
-        for i, (table, values) in enumerate(zip(self._signals.values(), numbers[1:], strict=True)):
-            if isinstance(table, SpeedTable):
-                # over a gap, too, as if the speed had changed linearly
-                values = cumulative_trapezoid(to_si(table, values), numbers[0], initial=0.0)
-            elif wrap := getattr(table, "wrap", None):
-                values = np.unwrap(values, period=wrap)
-            values = (values + (self._ends[i] - values[0] if before else 0.0))[before:]
-            self._ends[i] = values[-1]
-            signals.append(values if isinstance(table, SpeedTable) else to_si(table, values))
-        return np.stack(signals)
-
-
 class Stream:
     """Rows of a source in SI units, one sampling period apart.
 
     Up to two lost samples in a row are interpolated, as in a log: positions linearly, while the input is held. After a
-    longer gap a new segment starts.
+    longer gap a new segment starts. Turns of wrapped positions and integrals of speeds go on from block to block.
 
     Args:
         source: of the rows.
@@ -191,11 +123,10 @@ class Stream:
         period: expected sampling period, s.
     """
 
-    _reader: _ChannelReader
-
     def __init__(self, source: "Source", table: LogTable, period: float):
         self.source, self.counts = source, source.counts
         self._table, self._period = table, period
+        self._clock, self._signals = table.t or TimeTable(), _stream_signals(table)
         self._columns: Sequence[ColumnName] = ()
         self._is_period_right: bool | None = None
 
@@ -213,16 +144,20 @@ class Stream:
         if columns is not self._columns and not self._read_columns(columns):
             self._count(OTHER_COLUMNS, len(values))
             return []
-        decoded, unreadable = self._reader.decode(values, self._period)
-        self._count(UNREADABLE, unreadable)
-        samples = self._reader.convert(self._leave_out_outliers(decoded))
+        before = self._recent[:, -1:]
+        samples = self._convert(before, self._leave_out_outliers(self._decode(values)))
         self._check_period(samples[0])
         return self._split_rows(samples)
 
     def _read_columns(self, columns: Sequence[ColumnName]) -> bool:
         """Read other columns from now on; False if there are columns that have been read, and one of these is missing."""
+        file = LogFile(Path(self.source.name), Columns(dict.fromkeys(columns, ())))
+        keys = {source.column_or(channel): channel for channel, source in [("t", self._clock), *self._signals.items()]}
         try:
-            self._reader = _ChannelReader(self._table, self.source.name, columns)
+            self._indices = {
+                column: list(columns).index(file.find_column(column, keys.get(column, "")))
+                for column in stream_columns(self._table)
+            }
         except InputError as error:
             if not self._columns:
                 raise
@@ -230,15 +165,61 @@ class Stream:
             return False
         # another sender may have another clock, period and zero
         self._recent = self._held = self._last = np.empty((4, 0))
+        self._ends, self._row = np.zeros(3), 0
         self._first_stamps: list[float] = []
         self._columns = columns
         return True
+
+    def _decode(self, values: Array) -> Array:
+        """Return stamps (s), torque, motor and load as they were sent, shape (4, samples), of rows that can be read."""
+        # the same as pandas' comparison of a column with a number, true or false
+        for column, required in (self._table.where or {}).items():
+            values = values[values[:, self._indices[column]] == required]
+        columns = {column: values[:, index] for column, index in self._indices.items()}
+        if self._clock.period is not None:
+            stamps = (self._row + np.arange(len(values))) * self._clock.period
+            self._row += len(values)
+        else:
+            stamps = columns[self._clock.column_or("t")] * SECONDS_PER_UNIT[self._clock.unit]
+        signals, is_readable = [stamps], np.abs(stamps) * np.finfo(float).eps < 0.5 * self._period
+        for channel, table in self._signals.items():
+            numbers = decode_words(table, columns[table.column_or(channel)])
+            if (minus := getattr(table, "minus", None)) is not None:
+                numbers = numbers - decode_words(table, columns[minus])
+            elif wrap := getattr(table, "wrap", None):
+                is_readable &= np.abs(numbers) <= 2.0 * wrap
+            signals.append(numbers)
+        samples = np.stack(signals)
+        samples = samples[:, is_readable & (np.abs(samples) <= LARGEST).all(axis=0)]
+        self._count(UNREADABLE, len(values) - samples.shape[1])
+        return samples
+
+    def _convert(self, before: Array, samples: Array) -> Array:
+        """Convert decoded samples, shape (4, samples), to SI units, with the turns that they belong to.
+
+        `before` is the sample before them, if there is one, shape (4, 0 or 1).
+        """
+        from scipy.integrate import cumulative_trapezoid
+
+        if not samples.shape[1]:
+            return samples
+        numbers, known, signals = np.concatenate([before, samples], axis=1), before.shape[1], [samples[0]]
+        for i, (table, values) in enumerate(zip(self._signals.values(), numbers[1:], strict=True)):
+            if isinstance(table, SpeedTable):
+                # over a gap, too, as if the speed had changed linearly
+                values = cumulative_trapezoid(to_si(table, values), numbers[0], initial=0.0)
+            elif wrap := getattr(table, "wrap", None):
+                values = np.unwrap(values, period=wrap)
+            values = (values + (self._ends[i] - values[0] if known else 0.0))[known:]
+            self._ends[i] = values[-1]
+            signals.append(values if isinstance(table, SpeedTable) else to_si(table, values))
+        return np.stack(signals)
 
     def _count(self, fault: str, number: int) -> None:
         if number:
             self.counts[fault] += int(number)
 
-    def _leave_out_outliers(self, samples: np.ndarray) -> np.ndarray:
+    def _leave_out_outliers(self, samples: Array) -> Array:
         """Leave out single rows far from both neighbours, which would move the observers or the clock for long.
 
         A row at the end that is far from the one before is held until the next one has come.
@@ -247,7 +228,11 @@ class Stream:
         samples, self._held = np.concatenate([self._recent, self._held, samples], axis=1), samples[:, :0]
         is_new = np.arange(samples.shape[1]) >= recent
         if samples.shape[1] > 2:
-            steps = self._reader.steps(samples)
+            steps = np.diff(samples)
+            for i, table in enumerate(self._signals.values(), 1):
+                # the shorter way
+                if wrap := getattr(table, "wrap", None):
+                    steps[i] = (steps[i] + 0.5 * wrap) % wrap - 0.5 * wrap
             sizes = np.abs(steps)
             usual = np.quantile(sizes, _USUAL_STEPS, axis=1)
             # at standstill: a count
@@ -266,7 +251,7 @@ class Stream:
         self._recent = np.concatenate([self._recent, new], axis=1)[:, -_RECENT_ROWS:]
         return new
 
-    def _check_period(self, stamps: np.ndarray) -> None:
+    def _check_period(self, stamps: Array) -> None:
         """Compare the period of the first rows with the expected one."""
         if len(self._first_stamps) >= _PERIOD_ROWS:
             return
@@ -288,7 +273,7 @@ class Stream:
             self.source.fault = f"; {fault}"
         self._is_period_right = fault is None
 
-    def _split_rows(self, samples: np.ndarray) -> list[Rows]:
+    def _split_rows(self, samples: Array) -> list[Rows]:
         """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
         stamps = samples[0]
         if self._is_period_right is False and len(self._first_stamps) >= _PERIOD_ROWS:
@@ -317,7 +302,7 @@ class Stream:
             returned = 0
         return rows
 
-    def _interpolate_lost(self, samples: np.ndarray, returned: int) -> Rows:
+    def _interpolate_lost(self, samples: Array, returned: int) -> Rows:
         """Return rows without a gap, with lost samples interpolated; stamps may jitter by less than half a period.
 
         The first of the samples was `returned` already (1), or a segment starts with it (0).
@@ -594,12 +579,10 @@ class Datagrams(Source):
 
 
 def _parse_address(address: str) -> tuple[str, int]:
-    error = InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")
-    try:
+    # for a port that is no number, or an unfinished address
+    with suppress(ValueError):
         parts = urlsplit(address)
         host, port = parts.hostname, parts.port
-    except ValueError:
-        raise error from None
-    if parts.scheme != "udp" or not host or port is None or parts.path.strip("/") or parts.query:
-        raise error
-    return host, port
+        if parts.scheme == "udp" and host and port is not None and not (parts.path.strip("/") or parts.query):
+            return host, port
+    raise InputError(f"{address}: should be udp://HOST:PORT, as udp://127.0.0.1:9870")

@@ -15,12 +15,12 @@ from .gearing import UNRELATED, Gearing, twist_noise
 from .least_squares import rms
 from .resampling import Grid
 from .rigid_body import RigidFit
-from .signal_quality import ChannelStatistics, find_resolution, find_runs
+from .signal_quality import Array, ChannelStatistics, find_resolution, find_runs
 from .table import POSITION_CHANNELS, LogTable
 from .time_stamps import SegmentedStamps, fit_even_stamps
 
 
-def check_position_moves(file: LogFile, name: str, values: np.ndarray) -> None:
+def check_position_moves(file: LogFile, name: str, values: Array) -> None:
     """Refuse a position that moves by at most three steps of its resolution."""
     step = find_resolution(values)
     if step and np.ptp(values) < 3.5 * step:
@@ -55,13 +55,11 @@ def note_standstill(file: LogFile, segmented: SegmentedStamps, channels: Mapping
                 is_extreme = values[standstill.start] in (values.min(), values.max())
                 stands = f"{name} stands still{' at the end of its range' * is_extreme} from {begin:.4g} to {end:.4g} s"
                 moves = f"{other} moves by {np.ptp(moving[standstill]):.3g} {channels[other].unit}"
-                file.notes.append(
-                    f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow."
-                )
+                file.note(f"{stands} while {moves}: readings that are frozen or cut off, or a side that does not follow.")
                 break
 
 
-def _find_standstills(values: np.ndarray, segments: Sequence[slice]) -> Iterator[slice]:
+def _find_standstills(values: Array, segments: Sequence[slice]) -> Iterator[slice]:
     """Yield the rows of segments in which the values are equal for at least `_STANDSTILL_SAMPLES`."""
     for segment in segments:
         for start, stop in zip(*find_runs(np.diff(values[segment]) == 0.0), strict=True):
@@ -94,7 +92,7 @@ def check_gear_ratio(
         _check_motion_sizes(file, table, grid, expected)
     if gearing is None or gearing.residual >= UNRELATED:
         unexplained = "" if gearing is None else f" ({100 * gearing.residual:.0f} % of theta_e is not explained by theta_s)"
-        file.notes.append(
+        file.note(
             f"theta_e and theta_s are hardly related{unexplained}: they may belong to different drives, or the load hardly "
             "moves beyond the lost motion."
         )
@@ -128,13 +126,11 @@ def _check_ratio(file: LogFile, table: LogTable, gearing: Gearing, expected: flo
         mistake = "gear_ratio, or a unit in [log], is wrong"
     comparison = f"theta_e moves {gearing.ratio:.4g} for each 1 of theta_s, where gear_ratio is {expected:g}"
     if abs(relative_ratio - 1.0) <= GEAR_TOLERANCE:
-        file.warnings.append(
-            f"{DOUBT}{comparison}: wind-up of a soft shaft may cause this, or gear_ratio is a little wrong."
-        )
+        file.warn(f"{DOUBT}{comparison}: wind-up of a soft shaft may cause this, or gear_ratio is a little wrong.")
         return
     if gearing.residual < 0.05:
         raise file.error(f"{comparison}: {mistake}")
-    file.notes.append(f"{comparison}, but the two are related only roughly; perhaps {mistake}.")
+    file.note(f"{comparison}, but the two are related only roughly; perhaps {mistake}.")
 
 
 def _likely_mistakes(table: LogTable, expected: float) -> list[tuple[float, str]]:
@@ -187,30 +183,28 @@ def _check_twist_range(file: LogFile, unit: str, gearing: Gearing, expected: flo
             f"would be {gearing.least_twist:.3g} {unit})"
         )
     opposite_sign = " They mostly move in opposite directions: perhaps the sign of one of them is wrong."
-    file.notes.append(
+    file.note(
         f"{ranges}: with backlash or wind-up of that size this log hardly confirms gear_ratio."
         + (opposite_sign if gearing.ratio * expected < 0.0 else "")
     )
 
 
 def _shows_inertia(rigid_fit: RigidFit, standard_errors: float) -> bool:
-    """Return True if the torque clearly shows an inertia beyond so many standard errors; a negative one, if these are."""
+    """Return True if the torque clearly shows an inertia beyond so many standard errors; a negative one, if these are.
+
+    A positive one shows that the sign of the torque is right, whatever else is odd: a lag turns the torque of an inertia
+    against the speed; a wrong sign turns it against the acceleration, too.
+    """
     is_clear = rigid_fit.inflation[0] < 10.0 and rigid_fit.shares[0] > 0.1
     inertia = math.copysign(1.0, standard_errors) * rigid_fit.values[0]
     return bool(is_clear and inertia > abs(standard_errors) * rigid_fit.errors[0])
-
-
-def _accelerates_with_torque(rigid_fit: RigidFit) -> bool:
-    """Return True if the sign of the torque is right, whatever else is odd: a lag turns the torque of an inertia against the
-    speed; a wrong sign turns it against the acceleration, too."""
-    return _shows_inertia(rigid_fit, 3.0)
 
 
 _MAX_RETURNED_WORK = -0.5
 """Share of the exchanged work, below which more comes back than any model of a drive can return."""
 
 
-def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: np.ndarray) -> None:
+def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: Array) -> None:
     """Refuse a torque of the wrong sign, or remark on a doubtful one.
 
     A passive drive takes energy from its input, and its inertia is positive. `position` is that of the encoder which the
@@ -235,14 +229,14 @@ def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: 
     # a load that drives the motor returns work as well: no error
     if work_share < -0.1:
         returned_text = f"the drive returns {-100 * work_share:.0f} % of the work"
-        file.warnings.append(f"{DOUBT}{returned_text}: the load drives it, or u has the wrong sign or acts late.")
-        if work_share < _MAX_RETURNED_WORK and not _accelerates_with_torque(rigid_fit):
+        file.warn(f"{DOUBT}{returned_text}: the load drives it, or u has the wrong sign or acts late.")
+        if work_share < _MAX_RETURNED_WORK and not _shows_inertia(rigid_fit, 3.0):
             file.contradiction = (
                 f"{returned_text}, as only a drive with a driving load does: set sign = -1 in [log] u, or take a log in "
                 "which the motor drives"
             )
     elif accelerates_against_torque and work_share < 0.1:
-        file.notes.append("The drive seems to accelerate against u: see its sign, unit and column.")
+        file.note("The drive seems to accelerate against u: see its sign, unit and column.")
 
 
 _DOUBTFUL_INERTIA = 10.0
@@ -309,11 +303,11 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
         # the nominal friction may be wrong, so this alone is not sure
         is_doubtful, is_surely_wrong, ratio = True, False, 1.0 / power_ratio
     if is_doubtful:
-        file.warnings.append(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
+        file.warn(f"{DOUBT}{text}: check the units of t, u and {channel} in [log], and the model.")
     # friction and inertia that are off in the same direction are no coincidence
     same_direction = has_odd_friction and (power_ratio > 1.0) == (ratio > 1.0)
     # friction that falls with the speed takes work none the less
-    is_reversed = friction_power < 0.0 and shows_viscous and not _accelerates_with_torque(rigid_fit)
+    is_reversed = friction_power < 0.0 and shows_viscous and not _shows_inertia(rigid_fit, 3.0)
     if is_reversed and -3.0 * nominal_viscous < viscous < -nominal_viscous / 3.0:
         file.contradiction = (
             f"u falls with the speed as a viscous friction of {viscous:.3g} would make it, the model's is "
@@ -329,29 +323,29 @@ def flag_wrong_units(file: LogFile, rigid_fit: RigidFit, channel: str, nominal: 
 def note_channel_faults(file: LogFile, name: str, statistics: ChannelStatistics, rate: float) -> None:
     """Remark on jumps, saturation and improbable speeds of a channel; `rate` is its rate of change, unit/s."""
     if statistics.jumps:
-        file.notes.append(
+        file.note(
             f"{name}: {statistics.jumps} jump{'s' * (statistics.jumps > 1)} that the motion does not explain: "
             "dropped counts or disturbed readings."
         )
     if statistics.saturated:
-        file.notes.append(f"{name} is saturated in {percent(statistics.saturated)} of the samples.")
+        file.note(f"{name} is saturated in {percent(statistics.saturated)} of the samples.")
     # 1e4 rad/s, about 100 000 rpm, is beyond drives
     if statistics.unit == "rad" and rate > 1e4:
         rpm = rate * 30.0 / math.pi
-        file.warnings.append(f"{DOUBT}{name} reaches {rate:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
+        file.warn(f"{DOUBT}{name} reaches {rate:.3g} rad/s, {rpm:.3g} rpm: check its unit, and that of t.")
 
 
 _CLEAR_STAMP_FAULT = 5.0
 """Factor by which even samples have to be smoother than their stamps make them: resampling changes noise by at most two."""
 
 
-def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: np.ndarray, resampled: np.ndarray) -> None:
+def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: Array, resampled: Array) -> None:
     """Warn of stamps that make a motion rougher than even samples do: a host's, with the delays of its bus and system."""
     even_noise, stamped_noise = (rms(np.diff(values, n=4)) for values in (readings[segmented.segments[0]], resampled))
     if stamped_noise > _CLEAR_STAMP_FAULT * even_noise:
         period = fit_even_stamps(segmented.times[segmented.segments[0]]).period
         times_better = stamped_noise / max(even_noise, 1e-300)
-        file.warnings.append(
+        file.warn(
             f"The samples fit even stamps {times_better:.2g} times better than their own: these are a host's, not "
             f"the drive's. [log] t = {{ period = {period:.4g} }} reads them as even, if no row was lost."
         )
@@ -362,7 +356,7 @@ def note_gearing(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelS
     skew, error = gearing.skew or 0.0, gearing.skew_error or 0.0
     if abs(skew) > max(6.0 * error, 0.05 * period):
         direction = "lags" if skew > 0.0 else "leads"
-        file.notes.append(
+        file.note(
             f"theta_s {direction} theta_e by {1e3 * abs(skew):.3g} ± {1e3 * error:.2g} ms: a skew of "
             "the stamps, or viscous friction of the load that winds up the shaft; this log cannot tell them apart."
         )
@@ -372,10 +366,10 @@ def note_gearing(file: LogFile, gearing: Gearing, statistics: dict[str, ChannelS
         times = ", ".join(f"{t:.3g}" for t in gearing.flank_times[:6]) + (", ..." if len(gearing.flank_times) > 6 else "")
         low, high = gearing.lost_motion_range
         single_change = " With one change only, a slipped coupling or lost counts would look the same."
-        file.notes.append(
+        file.note(
             f"{text}, from positions passed in the same direction before and after the load torque changed its sign, at "
             f"{times} s; {low:.2g} to {high:.2g} {unit} by position."
             + (single_change if len(gearing.flank_times) == 1 else "")
         )
     elif gearing.exceeds_noise(twist_noise(gearing.ratio, statistics)) and not gearing.is_loose:
-        file.notes.append(f"{text}, from {gearing.flank_changes} changes of the flank by the direction of motion.")
+        file.note(f"{text}, from {gearing.flank_changes} changes of the flank by the direction of motion.")

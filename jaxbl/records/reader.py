@@ -33,6 +33,7 @@ from .plausibility import (
 from .resampling import Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import (
+    Array,
     ChannelStatistics,
     count_jumps,
     find_bandwidth,
@@ -43,7 +44,7 @@ from .signal_quality import (
     saturated_share,
 )
 from .table import ELEMENT_NEEDS, POSITION_CHANNELS, LogTable
-from .time_stamps import Sampling, SegmentedStamps, join_files, read_time_stamps, split_at_gaps
+from .time_stamps import Sampling, SegmentedStamps, join_file, read_time_stamps, split_at_gaps
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,12 @@ class Record:
     """
 
     path: Path
-    time: np.ndarray
+    time: Array
     sample_period: float
-    torque: np.ndarray | None
-    positions: dict[str, np.ndarray]
-    transmitted: np.ndarray | None
-    reference: np.ndarray | None
+    torque: Array | None
+    positions: dict[str, Array]
+    transmitted: Array | None
+    reference: Array | None
     closed_loop: bool | None
     start: float
     segments: tuple[slice, ...]
@@ -104,7 +105,7 @@ class Record:
     corrections: dict[str, float]
     contradiction: str
     statistics: LogStatistics
-    intervals: np.ndarray
+    intervals: Array
     logs: tuple[tuple[Path, slice], ...]
 
     def unit_of(self, path: str, unit: str) -> str:
@@ -158,7 +159,8 @@ def read_record(
     """
     table = read_log_table(log)
     file = read_log_file(Path(path), table.list_columns())
-    join_files(file, table)
+    for name in table.join or ():
+        join_file(file, table, name)
     # columns become SI channels at the time stamps of the log
     stamps = read_time_stamps(file, table)
     channels = read_channels(file, table, stamps)
@@ -166,13 +168,15 @@ def read_record(
     segmented = split_at_gaps(file, stamps)
     channels = {name: raw._replace(values=raw.values[segmented.distinct]) for name, raw in channels.items()}
     encoders = [name for name in POSITION_CHANNELS.values() if name in channels]
-    if table.kind == "element" and "theta_e" not in encoders:
-        raise file.error(f"has no theta_e: {ELEMENT_NEEDS}; [log] theta_e can name its column")
-    # the sides of an element move on their own, if they move
     is_drive = table.kind == "drive"
-    for name in encoders if is_drive else encoders[:1]:
+    if not is_drive:
+        if "theta_e" not in encoders:
+            raise file.error(f"has no theta_e: {ELEMENT_NEEDS}; [log] theta_e can name its column")
+        # the sides of an element move on their own, if they move
+        encoders = ["theta_e"]
+    for name in encoders:
         check_position_moves(file, name, channels[name].values)
-    has_both_encoders = is_drive and len(encoders) == 2
+    has_both_encoders = len(encoders) == 2
     if has_both_encoders:
         note_standstill(file, segmented, channels)
     # these become evenly spaced samples
@@ -247,9 +251,12 @@ def _resample_and_align(
     channels, period = {**channels}, table.resample or segmented.period
     regular = segmented.sampling.even and math.isclose(period, segmented.period, rel_tol=1e-9)
 
-    def resample() -> tuple[Grid, Gearing | None]:
+    def resample(changed: str = "", **changes: Any) -> tuple[Grid, Gearing | None]:
+        """Resample the channels, one of them with changes."""
+        if changed:
+            channels[changed] = channels[changed]._replace(**changes)
         grid = resample_channels(file, segmented, channels, period, interpolate=not regular)
-        if table.kind == "element" or len(encoders) < 2:
+        if len(encoders) < 2:
             return grid, None
         turn = math.inf if channels["theta_s"].unit == "m" else 2.0 * math.pi
         return grid, fit_gearing(grid.first(share), expected=gear_ratio, turn=turn)
@@ -260,11 +267,10 @@ def _resample_and_align(
         lateness = estimate_lateness(grid.first(share), encoders, segmented.period)
         if lateness is not None and (keys := _find_torque_keys(file, table, lateness, nominal, segmented.period)):
             hold, skew = keys
-            channels["u"] = channels["u"]._replace(hold=hold, skew=skew)
             file.corrections |= {"u.skew": skew, "u.sampled": float(hold == "sampled")}
             late = skew + (0.5 * segmented.period if hold == "sampled" else 0.0)
             lateness = lateness._replace(value=lateness.value - late)
-            grid, gearing = resample()
+            grid, gearing = resample("u", hold=hold, skew=skew)
     is_estimated = table.theta_s is not None and table.theta_s.skew == "estimate"
     shaft = shaft if _is_left_out(table, "skew") else None
     sentences = []
@@ -272,8 +278,7 @@ def _resample_and_align(
         drift = _find_clock_drift(gearing, grid.first(share), shaft)
         if drift is not None:
             middle = 0.5 * float(grid.time[0] + grid.time[-1])
-            channels["theta_s"] = channels["theta_s"]._replace(skew=-drift.value * middle, drift=drift.value)
-            grid, gearing = resample()
+            grid, gearing = resample("theta_s", skew=-drift.value * middle, drift=drift.value)
             sentences.append(
                 f"The clocks drift apart: theta_s becomes later than theta_e by {1e6 * drift.value:.4g} ± "
                 f"{1e6 * drift.error:.1g} us each second. This was corrected."
@@ -291,23 +296,25 @@ def _resample_and_align(
                 f"{1e3 * clock_skew.max_windup_delay:.2g} ms, so this was corrected."
             )
     if skew:
-        channels["theta_s"] = channels["theta_s"]._replace(skew=channels["theta_s"].skew + skew)
-        grid, gearing = resample()
+        grid, gearing = resample("theta_s", skew=channels["theta_s"].skew + skew)
     if sentences:
-        file.warnings.append(" ".join([*sentences, _describe_delay_keys(table, channels["theta_s"])]))
+        load, (name, _) = channels["theta_s"], table.position_source("theta_s")
+        drift_key = f" (at the first stamp) and {name}.drift = {load.drift:.4g}" if load.drift else ""
+        keys = f"[log] {name}.skew = {load.skew:.4g}{drift_key} corrects the same; 0 corrects nothing."
+        file.warn(" ".join([*sentences, keys]))
     if shaft is not None:
         load = channels["theta_s"]
         file.corrections |= {key: value for key, value in (("skew", load.skew), ("drift", load.drift)) if value}
     if not regular:
         purpose = "to the period of [log] resample, or of the other logs" if table.resample else "from uneven stamps"
-        file.notes.append(
+        file.note(
             f"Resampled {purpose}: every {1e3 * period:.6g} ms, in the log every {1e3 * segmented.period:.6g} ms; positions "
             "by cubic splines, torques by means that keep their integral."
         )
     for name, raw in channels.items():
         if raw.skew or raw.drift:
             growth = f", growing by {1e6 * raw.drift:.4g} us each second" if raw.drift else ""
-            file.notes.append(f"{name}: shifted by its skew of {1e3 * raw.skew:.4g} ms{growth}.")
+            file.note(f"{name}: shifted by its skew of {1e3 * raw.skew:.4g} ms{growth}.")
     return grid, gearing, regular, lateness
 
 
@@ -321,7 +328,7 @@ def _find_torque_keys(
         return None
     text = f"u is {_describe_delay(lateness.value, lateness.error)} than the motion that it causes"
     if half_periods is None:
-        file.notes.append(
+        file.note(
             f"{text}, which is no multiple of half a period: a filter of u, a soft shaft or a lag may cause it. Nothing was "
             f"corrected; [log] u.skew = {lateness.value:.3g} does so."
         )
@@ -335,11 +342,9 @@ def _find_torque_keys(
         cause = "early stamps, or a dead time or lag of the actuator; this log cannot tell them apart"
     dead_time = "modelled" if nominal is None else nominal.dead_time
     if dead_time == "modelled" or (dead_time == "sought" and half_periods < 0):
-        file.warnings.append(f"{text}: {cause}. Nothing was corrected; [log] {keys} does so.")
+        file.warn(f"{text}: {cause}. Nothing was corrected; [log] {keys} does so.")
         return None
-    file.warnings.append(
-        f"{text}: {cause}. This was corrected. [log] {keys} corrects the same; u.skew = 0 corrects nothing."
-    )
+    file.warn(f"{text}: {cause}. This was corrected. [log] {keys} corrects the same; u.skew = 0 corrects nothing.")
     return hold, skew
 
 
@@ -364,7 +369,7 @@ def _estimate_skew(file: LogFile, gearing: Gearing | None, period: float) -> flo
             f"theta_s.skew = 'estimate': the estimate is {estimate}; its error should be less than half the period of "
             f"{1e3 * period:.4g} ms; give the skew in s, or leave it out"
         )
-    file.notes.append(f"The skew of theta_s was estimated against theta_e: {estimate}.")
+    file.note(f"The skew of theta_s was estimated against theta_e: {estimate}.")
     return gearing.skew
 
 
@@ -376,13 +381,6 @@ def _is_left_out(table: LogTable, key: str) -> bool:
 
 def _describe_delay(value: float, error: float) -> str:
     return f"{1e3 * abs(value):.3g} ± {1e3 * error:.1g} ms {'later' if value > 0.0 else 'earlier'}"
-
-
-def _describe_delay_keys(table: LogTable, load: RawChannel) -> str:
-    """Describe the keys of `[log]` that would correct the same skew."""
-    name, _ = table.position_source("theta_s")
-    drift_key = f" (at the first stamp) and {name}.drift = {load.drift:.4g}" if load.drift else ""
-    return f"[log] {name}.skew = {load.skew:.4g}{drift_key} corrects the same; 0 corrects nothing."
 
 
 def _correct_offset(
@@ -400,7 +398,7 @@ def _correct_offset(
         grid.values[name] = grid.values[name] + change
         channels[name] = channels[name]._replace(values=channels[name].values + change)
     if integrals:
-        file.notes.append(
+        file.note(
             f"{name} is an integral: {change:.4g} {channels[name].unit} were added, so that it fits the other encoder."
         )
         return
@@ -408,13 +406,13 @@ def _correct_offset(
     twist = f"theta_e - {nominal.gear_ratio:g} theta_s"
     if offset.is_sure:
         file.corrections["offset"] = change
-        file.warnings.append(
+        file.warn(
             f"{twist} is {size} without torque. This offset between the encoders was corrected. [log] theta_e.offset = "
             f"{change:.4g} corrects the same; 0 corrects nothing."
         )
         return
     cause = f"a constant torque {'in the shaft' if offset.both_flanks else 'that holds the load on one flank of a gap'}"
-    file.warnings.append(
+    file.warn(
         f"{twist} is {size} in the mean: an offset between the encoders, or {cause}; this log cannot tell them apart. "
         f"[log] theta_e.offset = {change:.4g} corrects it as an offset; 0 corrects nothing."
     )
@@ -509,7 +507,7 @@ def _require_channels(record: Record, names: Iterable[str], other: Record) -> No
         )
 
 
-def _list_channels(record: Record) -> dict[str, np.ndarray]:
+def _list_channels(record: Record) -> dict[str, Array]:
     channels = {f"{side} position": values for side, values in record.positions.items()}
     channels |= {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
     return {name: values for name, values in channels.items() if values is not None}

@@ -171,6 +171,8 @@ class TorqueTable(_ChannelTable):
         return self
 
 
+ChannelTable = PositionTable | SpeedTable | TorqueTable
+"""Table of a measured channel."""
 _ChannelName = Literal["u", "theta_e", "theta_s"]
 POSITION_CHANNELS = {"motor": "theta_e", "load": "theta_s"}
 """Side of the drive -> the channel of its encoder."""
@@ -259,7 +261,7 @@ class LogTable(StrictTable):
         return self
 
     @property
-    def channels(self) -> dict[str, TimeTable | PositionTable | SpeedTable | TorqueTable | None]:
+    def channels(self) -> dict[str, TimeTable | ChannelTable | None]:
         """Tables of time and channels; None if they are left out."""
         names = ("t", "u", *POSITION_CHANNELS.values(), *SPEED_CHANNELS.values(), "transmitted", "reference")
         return {name: getattr(self, name) for name in names}

@@ -13,7 +13,7 @@ from jaxbl.workers import check_cost
 
 from .files import LogFile, read_log_file
 from .libraries import Column, ColumnName, read_at
-from .signal_quality import MIN_SAMPLES, count_samples, find_resolution, longest_segment, slices_between
+from .signal_quality import MIN_SAMPLES, Array, count_samples, find_resolution, longest_segment, slices_between
 from .table import LogTable, TimeTable
 
 GAP_PERIODS = 3.5
@@ -63,9 +63,9 @@ class TimeStamps(NamedTuple):
         max_interval: longest interval without a gap, s.
     """
 
-    times: np.ndarray
+    times: Array
     start: float
-    rows: np.ndarray
+    rows: Array
     file_rows: int
     median_interval: float
     max_interval: float
@@ -82,8 +82,8 @@ class SegmentedStamps(NamedTuple):
         sampling: statistics of the stamps.
     """
 
-    times: np.ndarray
-    distinct: np.ndarray
+    times: Array
+    distinct: Array
     segments: list[slice]
     period: float
     sampling: Sampling
@@ -114,58 +114,54 @@ def read_time_stamps(file: LogFile, table: LogTable) -> TimeStamps:
     if not _SHORTEST_PERIOD <= median <= _LONGEST_PERIOD:
         raise file.error(f"the period of the time stamps is {median:g} s, as no drive is sampled; see [log] t.unit")
     if median >= _DOUBTFUL_PERIOD:
-        file.warnings.append(f"{DOUBT}the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
+        file.warn(f"{DOUBT}the period is {median:g} s; if the stamps are not in s, set [log] t.unit.")
     # 2.5: one group may be missing
     return TimeStamps(stamps[rows], start, rows, len(stamps), median, max(GAP_PERIODS * median, 2.5 * group_interval))
 
 
-def join_files(file: LogFile, table: LogTable) -> None:
-    """Add the columns of the files that `[log] join` names, at the stamps of the log.
+def join_file(file: LogFile, table: LogTable, name: str) -> None:
+    """Add the columns of a file that `[log] join` names, at the stamps of the log.
 
     Columns with times of their own are interpolated to these, and have no value outside of them; columns that start again
     (`wrap`) have their readings at the nearest times.
 
     Raises:
-        InputError: a file is missing or unfit, or its times are not those of the log.
+        InputError: the file is missing or unfit, or its times are not those of the log.
     """
     counters = {encoder.column for encoder in (table.theta_e, table.theta_s) if encoder is not None and encoder.wrap}
-    for name in table.join or ():
-        stem = Path(name).stem + "/"
-        if any(str(column).startswith(stem) for column in file.columns):
-            raise file.error(f"[log] join: two files are named {stem[:-1]}; rename one of them")
-        columns = [column.removeprefix(stem) for column in map(str, table.list_columns()) if column.startswith(stem)]
-        stamps = _read_stamps(file, table)
-        other = read_log_file(file.path.parent / name, {*columns, (table.t or TimeTable()).column_or("t")})
-        other_stamps = _read_stamps(other, table)
-        if (file.date is None) != (other.date is None):
-            raise other.error(f"has {'numbers' if file.date else 'dates'} as stamps, and {file.path} has not")
-        other_stamps = other_stamps + 1e-9 * ((other.date or 0) - (file.date or 0))
-        if max(stamps[0], other_stamps[0]) >= min(stamps[-1], other_stamps[-1]):
-            raise other.error(
-                f"its times, {other_stamps[0]:g} to {other_stamps[-1]:g} s, and those of {file.path}, {stamps[0]:g} to "
-                f"{stamps[-1]:g} s, do not overlap"
-            )
-        if not np.array_equal(stamps, other_stamps):
-            file.notes.append(f"{name} has times of its own; its columns are read at those of the log.")
-        for column in other.columns:
-            load = partial(_load_at, stamps, other, other_stamps, column, is_counter=f"{stem}{column}" in counters)
-            file.columns[f"{stem}{column}"] = Column(load, len(stamps))
+    stem = Path(name).stem + "/"
+    if any(str(column).startswith(stem) for column in file.columns):
+        raise file.error(f"[log] join: two files are named {stem[:-1]}; rename one of them")
+    columns = [column.removeprefix(stem) for column in map(str, table.list_columns()) if column.startswith(stem)]
+    stamps = _read_stamps(file, table)
+    other = read_log_file(file.path.parent / name, {*columns, (table.t or TimeTable()).column_or("t")})
+    other_stamps = _read_stamps(other, table)
+    if (file.date is None) != (other.date is None):
+        raise other.error(f"has {'numbers' if file.date else 'dates'} as stamps, and {file.path} has not")
+    other_stamps = other_stamps + 1e-9 * ((other.date or 0) - (file.date or 0))
+    if max(stamps[0], other_stamps[0]) >= min(stamps[-1], other_stamps[-1]):
+        raise other.error(
+            f"its times, {other_stamps[0]:g} to {other_stamps[-1]:g} s, and those of {file.path}, {stamps[0]:g} to "
+            f"{stamps[-1]:g} s, do not overlap"
+        )
+    if not np.array_equal(stamps, other_stamps):
+        file.note(f"{name} has times of its own; its columns are read at those of the log.")
+
+    def load_column(column: ColumnName) -> Array:
+        """Load a column of the other file at the stamps of the log, shape (stamps,); NaN outside of its own."""
+        other.check_length(column, len(other_stamps))
+        values = other.load_numbers(column)
+        if f"{stem}{column}" in counters:
+            middles = 0.5 * (other_stamps[1:] + other_stamps[:-1])
+            is_outside = (stamps < other_stamps[0]) | (stamps > other_stamps[-1])
+            return np.where(is_outside, np.nan, values[np.searchsorted(middles, stamps)])
+        return read_at(stamps, other_stamps, values)
+
+    for column in other.columns:
+        file.columns[f"{stem}{column}"] = Column(partial(load_column, column), len(stamps))
 
 
-def _load_at(
-    stamps: np.ndarray, other: LogFile, other_stamps: np.ndarray, column: ColumnName, *, is_counter: bool
-) -> np.ndarray:
-    """Load a column of another file at the stamps of a log, shape (stamps,); NaN outside of its own."""
-    other.check_length(column, len(other_stamps))
-    values = other.load_numbers(column)
-    if is_counter:
-        middles = 0.5 * (other_stamps[1:] + other_stamps[:-1])
-        is_outside = (stamps < other_stamps[0]) | (stamps > other_stamps[-1])
-        return np.where(is_outside, np.nan, values[np.searchsorted(middles, stamps)])
-    return read_at(stamps, other_stamps, values)
-
-
-def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
+def _read_stamps(file: LogFile, table: LogTable) -> Array:
     """Read the time stamps of all rows of the file, s, shape (rows of the file,)."""
     time_table = table.t or TimeTable()
     if time_table.period is not None:
@@ -187,7 +183,7 @@ def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
     return stamps
 
 
-def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
+def _find_full_rows(file: LogFile, table: LogTable, count: int) -> Array:
     """Tell which rows have a value in every channel: one that is logged less often has none in most rows."""
     is_full, needed_columns = np.ones(count, dtype=bool), table.list_columns() - {*(table.absent or ())}
     for column in file.columns:
@@ -196,13 +192,11 @@ def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
             if has_value.sum() >= MIN_SAMPLES and not has_value.all():
                 is_full &= has_value
                 empty = np.flatnonzero(~has_value)
-                file.notes.append(
-                    f"{len(empty)} rows without a value of '{column}' are left out (data row {empty[0] + 1} first)."
-                )
+                file.note(f"{len(empty)} rows without a value of '{column}' are left out (data row {empty[0] + 1} first).")
     return is_full
 
 
-def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray, is_full: np.ndarray) -> np.ndarray:
+def _select_rows(file: LogFile, table: LogTable, stamps: Array, is_full: Array) -> Array:
     """Return the numbers of the rows that `where`, `start` and `stop` select; `stamps` are s from the first one."""
     is_selected = is_full.copy()
     for column, required in (table.where or {}).items():
@@ -220,7 +214,7 @@ def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray, is_full: np
             f"[log] where, start and stop leave {len(rows)} of {len(stamps)} rows; at least {MIN_SAMPLES} are needed"
         )
     if len(rows) < is_full.sum():
-        file.notes.append(f"{len(rows)} of {len(stamps)} rows are read, by [log] where, start and stop.")
+        file.note(f"{len(rows)} of {len(stamps)} rows are read, by [log] where, start and stop.")
     return rows
 
 
@@ -247,7 +241,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     repeated = len(times) - int(distinct.sum())
     if repeated:
         row = rows[np.argmin(distinct)] + 1
-        file.notes.append(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
+        file.note(f"{repeated} rows have the stamp of the row before and were left out (data row {row} first).")
     times, rows = times[distinct], rows[distinct]
     pieces, segments = _split_at_intervals(times, stamps.max_interval)
     samples = sum(map(count_samples, segments))
@@ -260,7 +254,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     if len(pieces) > 1:
         longest_gap = np.argmax(intervals)
         left_out = len(times) - samples
-        file.notes.append(
+        file.note(
             f"Gaps: {len(pieces) - 1}; segments: {len(segments)}; the longest gap is {intervals[longest_gap]:.4g} s, "
             f"after data row {rows[longest_gap] + 1}"
             + (f"; {left_out} samples between gaps were left out." if left_out else ".")
@@ -271,9 +265,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     off = within * (intervals - (lost + 1.0) * period)
     if not is_even and 0.0 < lost.mean() < _MOST_LOST and abs(off).max() < 0.1 * period:
         first = np.argmax(lost > 0.0)
-        file.notes.append(
-            f"{lost.sum():.0f} rows are missing, after data row {rows[first] + 1} first; they are interpolated."
-        )
+        file.note(f"{lost.sum():.0f} rows are missing, after data row {rows[first] + 1} first; they are interpolated.")
     if is_even:
         for piece, fit in zip(segments, fits, strict=True):
             times[piece] = fit.first + fit.period * np.arange(count_samples(piece))
@@ -290,7 +282,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     return SegmentedStamps(times, distinct, segments, period, sampling)
 
 
-def _split_at_intervals(stamps: np.ndarray, max_interval: float) -> tuple[list[slice], list[slice]]:
+def _split_at_intervals(stamps: Array, max_interval: float) -> tuple[list[slice], list[slice]]:
     """Return the pieces between longer intervals, and those of them that are long enough for a segment."""
     starts = np.flatnonzero(np.diff(stamps) > max_interval) + 1
     pieces = slices_between([0, *starts.tolist(), len(stamps)])
@@ -305,7 +297,7 @@ class StampFit(NamedTuple):
     first: float
 
 
-def fit_even_stamps(stamps: np.ndarray) -> StampFit:
+def fit_even_stamps(stamps: Array) -> StampFit:
     """Fit an even grid to increasing stamps, s, shape (samples,), by least squares."""
     index = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
     middle = stamps.mean()
