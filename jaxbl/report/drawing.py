@@ -5,6 +5,7 @@ import contextlib
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -149,7 +150,7 @@ def picture(figure: Figure, path: Path | None = None) -> Picture:
 @style()
 def draw_canvas(figure: Figure) -> tuple[Canvas, list[Axes]]:
     """Draw a figure. Returns it, and the axes of its panels."""
-    panels, columns = figure.panels, min(figure.columns, len(figure.panels))
+    panels, columns = figure.panels, figure.columns
     rows = -(-len(panels) // columns)
     names = [_legend_handles(panel) for panel in panels]
     scales = _scales(panels)
@@ -218,15 +219,15 @@ def _draw_bar(canvas: Canvas, scale: Scale, **where: Any) -> None:
     bar = canvas.colorbar(ScalarMappable(_norm(scale), scale.colours), label=label, **where)
     bar.outline.set_visible(False)  # type: ignore[operator]
     if scale.log:
-        _set_log_ticks(bar.ax.yaxis, scale.low, scale.high)
+        _set_log_ticks(bar.ax.yaxis, (scale.low, scale.high))
 
 
 def _norm(scale: Scale) -> Normalize:
     return (LogNorm if scale.log else Normalize)(scale.low, scale.high)
 
 
-def _set_log_ticks(axis: Any, low: float, high: float) -> None:
-    places = round_ticks(low, high)
+def _set_log_ticks(axis: Any, ends: Sequence[float]) -> None:
+    places = round_ticks(*ends)
     axis.set_ticks(places, map(tick_text, places))
     # the many small ticks take longer than all else in a figure
     axis.set_ticks([], minor=True)
@@ -238,9 +239,8 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         ax.set(**{f"{name}label": axis.label, f"{name}scale": "log" if axis.log else "linear"})
         if axis.ends is not None:
             ax.set(**{f"{name}lim": axis.ends})
-    box = ax.get_position()
-    width, height = ax.figure.get_size_inches()  # type: ignore[union-attr]
-    ticks = {"x": int(np.clip(1.4 * width * box.width, 2, 8)), "y": int(np.clip(2.5 * height * box.height, 2, 6))}
+    width, height = np.divide(ax.bbox.size, ax.figure.dpi)
+    ticks = {"x": int(np.clip(1.4 * width, 2, 8)), "y": int(np.clip(2.5 * height, 2, 6))}
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):
         _DRAWERS[type(part)](ax, thin(part), 1.0 + layer / len(panel.parts))
@@ -249,25 +249,23 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     for name, axis in panel.axes.items():
         drawn = getattr(ax, f"{name}axis")
         if axis.names:
-            places, texts = zip(*axis.names, strict=True)
-            drawn.set_ticks(places, texts)
+            drawn.set_ticks(*zip(*axis.names, strict=True))
             drawn.grid(False)
         elif axis.log:
-            _set_log_ticks(drawn, *getattr(ax, f"get_{name}lim")())
+            _set_log_ticks(drawn, drawn.get_view_interval())
         else:
             drawn.set_major_locator(MaxNLocator(ticks[name], steps=[1, 2, 5, 10]))
         if axis.ratio is not None:
-            _draw_ratio(ax, name, *axis.ratio)
+            _draw_ratio(drawn, *axis.ratio)
 
 
-def _draw_ratio(ax: Axes, name: str, unit: float, label: str) -> None:
+def _draw_ratio(axis: Any, unit: float, label: str) -> None:
     """Draw the second scale of an axis, on the top or on the right."""
-    scales = lambda values: values / unit, lambda values: values * unit
-    second = getattr(ax, f"secondary_{name}axis")({"x": "top", "y": "right"}[name], functions=scales)
-    axis = getattr(second, f"{name}axis")
-    axis.set_label_text(label)
-    low, high = getattr(ax, f"get_{name}lim")()
-    _set_log_ticks(axis, low / unit, high / unit)
+    name, scales = axis.axis_name, (lambda values: values / unit, lambda values: values * unit)
+    second = getattr(axis.axes, f"secondary_{name}axis")({"x": "top", "y": "right"}[name], functions=scales)
+    second_axis = getattr(second, f"{name}axis")
+    second_axis.set_label_text(label)
+    _set_log_ticks(second_axis, axis.get_view_interval() / unit)
 
 
 def _line_look(line: Line) -> dict[str, Any]:
@@ -280,7 +278,7 @@ def _line_look(line: Line) -> dict[str, Any]:
 
 def _draw_line(ax: Axes, line: Line, layer: float) -> None:
     if line.held:
-        x, y = (np.clip(place, min(ends), max(ends)) for place, ends in ((line.x, ax.get_xlim()), (line.y, ax.get_ylim())))
+        x, y = np.clip(np.transpose([line.x, line.y]), ax.viewLim.min, ax.viewLim.max).T
         line = line._replace(x=x, y=y)
     look = _line_look(line) | {"alpha": line.opacity, "zorder": layer, "clip_on": not line.held}
     (artist,) = ax.plot(line.x, line.y, **look)
@@ -300,21 +298,21 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
         half = int(np.clip(room / max(np.hypot(*(path[1] - path[0])), 1e-9), 1, (len(path) - 1) // 2))
         first, middle, last = path[: -2 * half], path[half:-half], path[2 * half :]
         across, up = np.abs(last - first).T
-        (low, high), margin = np.asarray(ax.bbox), np.array([room, 2.0 * _NAME_SIZE])
-        fit = ((middle > low + margin) & (middle < high - margin)).all(axis=1) & (up < across)
-        beside = np.concatenate([np.full((1, 2), np.inf), *(neighbour for neighbour in paths if neighbour is not path)])
+        margin = np.array([room, 2.0 * _NAME_SIZE])
+        fit = ((middle > ax.bbox.min + margin) & (middle < ax.bbox.max - margin)).all(axis=1) & (up < across)
+        beside = np.concatenate([[2 * [np.inf]], *(neighbour for neighbour in paths if neighbour is not path)])
         apart = np.hypot(*(middle[:, None] - beside).transpose(2, 0, 1)).min(axis=1).clip(max=10.0 * _NAME_SIZE)
         worth = np.where(fit, apart - 4.0 * np.hypot(*(middle - 0.5 * (first + last)).T), -np.inf)
         if fit.any():
             i = int(np.argmax(worth))
             turn = float(np.arctan2(*(last - first)[i, ::-1]))
-            name = ax.annotate(
+            ax.annotate(
                 line.name, tuple(ax.transData.inverted().transform(middle[i])),
                 (-3.0 * np.sin(turn), 3.0 * np.cos(turn)),
                 textcoords="offset points", fontsize=_NAME_SIZE, ha="center", va="bottom", zorder=6, color=_NAME,
                 rotation=np.degrees(turn), rotation_mode="anchor",
+                path_effects=[withStroke(linewidth=2.5, foreground=_HALO)],
             )  # fmt: skip
-            name.set_path_effects([withStroke(linewidth=2.5, foreground=_HALO)])
 
 
 def _follow(ax: Axes, line: Line) -> np.ndarray:
@@ -322,8 +320,8 @@ def _follow(ax: Axes, line: Line) -> np.ndarray:
     with np.errstate(all="ignore"):
         path = ax.transData.transform(np.column_stack([line.x, line.y]))
     path = np.clip(np.nan_to_num(path), *ax.bbox.padded(100.0).get_points())
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    return np.stack([np.interp(np.linspace(0.0, way[-1], 301), way, places) for places in path.T], axis=1)
+    way = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T))]
+    return np.transpose([np.interp(np.linspace(0.0, way[-1], 301), way, places) for places in path.T])
 
 
 def _draw_band(ax: Axes, band: Band, layer: float) -> None:
@@ -339,12 +337,10 @@ def _draw_span(ax: Axes, span: Span, layer: float) -> None:
 
 
 def _draw_map(ax: Axes, cells: Map, layer: float) -> None:
-    how: Any = {"rasterized": True, "zorder": layer}
-    values = np.where(cells.failed, np.nan, cells.values)
+    draw = partial(ax.pcolormesh, cells.x, cells.y, rasterized=True, zorder=layer)
     if np.any(cells.failed):
-        grey = np.where(cells.failed, 0.0, np.nan)
-        ax.pcolormesh(cells.x, cells.y, grey, cmap=ListedColormap([MISSING]), **how)
-    ax.pcolormesh(cells.x, cells.y, values, cmap=cells.scale.colours, norm=_norm(cells.scale), **how)
+        draw(np.where(cells.failed, 0.0, np.nan), cmap=ListedColormap([MISSING]))
+    draw(np.where(cells.failed, np.nan, cells.values), cmap=cells.scale.colours, norm=_norm(cells.scale))
 
 
 def _draw_bars(ax: Axes, bars: Bars, layer: float) -> None:
