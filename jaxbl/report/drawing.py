@@ -239,7 +239,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         ax.set(**{f"{name}label": axis.label, f"{name}scale": "log" if axis.log else "linear"})
         if axis.ends is not None:
             ax.set(**{f"{name}lim": axis.ends})
-    width, height = ax.bbox.size / ax.figure.dpi
+    width, height = np.divide(ax.bbox.size, ax.figure.dpi)
     ticks = {"x": int(np.clip(1.4 * width, 2, 8)), "y": int(np.clip(2.5 * height, 2, 6))}
     # those that are held on the edge of the axes last, as these have to be known
     for layer, part in enumerate(sorted(panel.parts, key=lambda part: getattr(part, "held", False))):

@@ -93,7 +93,7 @@ def _first_axes(config: Config, dims: list[AxisColumns]) -> tuple[int, int]:
     """The dimensions along x and y of the first map: those of the study's first map, gains of one side, or the last two."""
     varied = [i for i, dim in enumerate(dims[:-1]) if _length(dim) > 1]
     numbers = {path: i for i in varied for path in dims[i]}
-    pairs = [(figure.x, figure.y) for figure in config.figures if figure.kind == "heatmap"]
+    pairs = [(figure.x, figure.y) for figure in config.figures]
     pairs += [(f"observer.{side}.alpha", f"observer.{side}.lambda") for side in config.sides]
     for x, y in pairs:
         if x in numbers and y in numbers and numbers[x] != numbers[y]:
@@ -143,7 +143,7 @@ def _stars(
     stars = []
     for index in sorted(np.ndindex(*shape[:-3]), key=lambda index: index != telling)[:64]:
         frame = runs.assign(**{name: cells[name][index].ravel() for name in needed})
-        if frame[["finite", f"{side}.converged"]].isna().any(axis=None):
+        if frame[["finite", f"{side}.converged"]].isna().to_numpy().any():
             continue
         worst = worst_runs(Groups([frame], paths, [*paths, "seed"]), first)
         if (best := best_gains(worst)) is not None:

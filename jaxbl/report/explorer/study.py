@@ -106,7 +106,7 @@ def write_study(
         Whether runs are still to come.
     """
     config = result.config
-    content = _about(config, result.columns, studies) | {"lead": lead}
+    content: JsonObject = _about(config, result.columns, studies) | {"lead": lead}
     names = [metric["name"] for metric in content["metrics"]]
     dims = dimensions(config)
     content |= write_cloud(result, names, out) if dims is None else write_grid(result, names, content["first"], out, dims)
@@ -133,11 +133,11 @@ def write_cloud(result: StudyResult, metrics: list[str], out: Path) -> JsonObjec
         return frame.assign(**places, **{name: drawable(drawn_values(frame, name)) for name in metrics})
 
     rows = write_points(out, types, map(page_columns, result.batches()))
-    descriptions = [
-        axis_words(config, axis.path) | {"words": words.get(axis.path), "log": axis.scale == "log"} for axis in config.axes
-    ]
     return {
-        "axes": descriptions,
+        "axes": [
+            axis_words(config, axis.path) | {"words": words.get(axis.path), "log": axis.scale == "log"}
+            for axis in config.axes
+        ],
         "rows": rows,
         "found": rows,
         "total": result.runs,
@@ -164,7 +164,8 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
     Raises:
         InputError: other values than those, or such as the study may not have.
     """
-    values, seed = (asked.get(name) if isinstance(asked, dict) else None for name in ("values", "seed"))
+    given = asked if isinstance(asked, dict) else {}
+    values, seed = given.get("values"), given.get("seed")
     paths = {*config.axis_paths}
     if not isinstance(values, dict) or set(values) != paths:
         raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
