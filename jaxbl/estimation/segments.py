@@ -80,8 +80,10 @@ class Segment:
         before = np.empty(0) if self.before is None else self.before
         held = np.concatenate([before, self.torque])
         earlier, mean = np.split(0.5 * (np.append(held[:1], held[:-1]) + held), [len(before)])
-        motion = [{side: smoothed.state[:, i].copy() for side, smoothed in self.smoothed.items()} for i in range(3)]
-        return Kinematics(self.time, mean, *motion, self.transmitted, before=earlier if len(earlier) else None)
+        motion = ({side: smoothed.state[:, i].copy() for side, smoothed in self.smoothed.items()} for i in range(3))
+        position, velocity, acceleration = motion
+        before = earlier if len(earlier) else None
+        return Kinematics(self.time, mean, position, velocity, acceleration, self.transmitted, before=before)
 
 
 def skip_unknown_input(record: Record, at_rest: bool) -> Record:
