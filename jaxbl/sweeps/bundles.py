@@ -59,13 +59,12 @@ class ClusterRun(StudyRun):
         self._cluster.submit_jobs(self._compute_bundle, list(self._make_bundles(missing[1:])))
 
     def _make_bundles(self, chunks: Sequence[Chunk]) -> Iterator[Bundle]:
-        """Yield bundles as they are asked for, of one chunk each until it is known how long a chunk takes."""
+        """Yield bundles as they are asked for, as small as they may be until it is known how long a chunk takes."""
         first, workers = 0, max(self._cluster.workers, 1)
         while first < len(chunks):
-            cost, size = self.engine.cost, 1
-            if cost["lanes"]:
-                seconds = cost["run_seconds"] / cost["lanes"] * chunks[first].lanes
-                size = _bundle_size(seconds, len(chunks), workers)
+            cost = self.engine.cost
+            lane_seconds = cost["run_seconds"] / cost["lanes"] if cost["lanes"] else math.inf
+            size = _bundle_size(lane_seconds * chunks[first].lanes, len(chunks), workers)
             yield chunks[first : first + size]
             first += size
 

@@ -131,7 +131,8 @@ class Engine:
     def use_layout(self, layout: Layout, backend: Backend) -> None:
         """Compute chunks of another shape, or by another backend, from now on."""
         check_cost("a chunk", _LANE_BYTES * math.prod(layout), "[sweep] chunk should be smaller, or left out")
-        self.layout, self.backend = layout, backend
+        self.layout = layout
+        self.backend: Backend = backend
         self._programs = RecentPrograms()
 
     @contextmanager
