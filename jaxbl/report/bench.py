@@ -13,12 +13,6 @@ from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, Be
 from .drawing import save
 from .panels import BLUE, GREEN, VERMILION, Axis, Bars, Figure, Line, Panel
 
-
-def draw_throughput(result: BenchResult) -> list[Figure]:
-    """The figures of a benchmark."""
-    return [_bars(result), _curve(result)]
-
-
 _SPEED = Axis("lane-steps per second", log=True)
 
 
@@ -110,6 +104,6 @@ def throughput_lines(result: BenchResult) -> Lines:
 def write_bench_report(result: BenchResult, folder: Path) -> Lines:
     """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
     write_json(folder / "bench.json", asdict(result))
-    for figure in draw_throughput(result):
+    for figure in (_bars(result), _curve(result)):
         save(figure, folder / "figures" / f"{figure.name}.png")
     return throughput_lines(result)
