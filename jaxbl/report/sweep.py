@@ -110,6 +110,7 @@ class _Survey:
     """The numbers behind the sentences and the table of axes, found in one reading.
 
     Attributes:
+        config: of the study.
         runs: their number; `even` those on points that are always simulated; `diverged`.
         converged: how many of the even ones converged, by side; none where the study does not say.
         by_value: the even runs and those that converged at each value of an axis of a grid, by side and path.
@@ -120,7 +121,7 @@ class _Survey:
     """
 
     def __init__(self, result: StudyResult):
-        config = result.config
+        config = self.config = result.config
         paths = config.axis_paths
         metrics = [name for name in result.columns if name.rpartition(".")[2] in ("converged", "velocity_rmse", *MARGINS)]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
@@ -156,9 +157,9 @@ class _Survey:
                 runs = worst_runs(Groups(Rows(result, columns), gains, paths), error)
                 self.best[side] = best_gains(runs), runs
 
-    def find_edge(self, side: str) -> tuple[str, float, float, float] | None:
-        """The axis, and the value up to which and beyond which a side converges in the most different shares of runs, with
-        both shares; None where no axis parts them by `_PARTED`."""
+    def describe_edge(self, side: str) -> str:
+        """Say up to which value of an axis, and beyond it, a side converges in the most different shares of runs; "" where
+        no axis parts them by `_PARTED`."""
         edges = []
         for (judged, path), counts in self.by_value.items():
             if judged == side and is_numeric_dtype(counts.index):
@@ -166,7 +167,11 @@ class _Survey:
                 above = counts.sum() - below
                 shares = zip(below.index, below["sum"] / below["size"], above["sum"] / above["size"], strict=True)
                 edges += [(path, *split) for split in shares if abs(split[1] - split[2]) >= _PARTED]
-        return max(edges, key=lambda edge: abs(edge[2] - edge[3]), default=None)
+        if not edges:
+            return ""
+        path, value, first, second = max(edges, key=lambda edge: abs(edge[2] - edge[3]))
+        place = with_value(self.config, path, float(f"{value:.3g}"))
+        return f" ({percent(first)} up to {place}, {percent(second)} beyond)"
 
     def list_ranges(self) -> Iterator[KeyFigure]:
         """From where to where metrics go, and in how many runs they are 0."""
@@ -188,10 +193,7 @@ def _headline(result: StudyResult, survey: _Survey, with_best: Iterable[str]) ->
     even = survey.even or math.nan
     works = dict.fromkeys(with_best, ", with the best gains in every run")
     for side in survey.converged.keys() - survey.best.keys():
-        if edge := survey.find_edge(side):
-            path, value, below, above = edge
-            place = with_value(result.config, path, float(f"{value:.3g}"))
-            works[side] = f" ({percent(below)} up to {place}, {percent(above)} beyond)"
+        works[side] = survey.describe_edge(side)
     shares = [
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()

@@ -132,14 +132,8 @@ def describe(tuning: Tuning) -> Result:
         # before all else
         verdict, headline = "failed", "The search found an error above what was proven."
         remarks = [*certified, *doubts, *reasons]
-    details, holdout = [line for line in summary["remarks"] if line not in doubts], summary["holdout"]
-    held_out = f"the held-out excitation ({holdout['excitation']['kind']})"
-    where = "the study's excitation with other noise" if holdout["same_excitation"] else held_out
-    tables = [
-        _gains_table(summary),
-        *certificate_tables(summary),
-        _comparison_table(f"On {where}, worst and median of all runs", holdout["rows"]),
-    ]
+    details = [line for line in summary["remarks"] if line not in doubts]
+    tables = [_gains_table(summary), *certificate_tables(summary), _comparison_table(summary["holdout"])]
     title, figures = tuning.config.title or "Gains", [*_key_figures(summary)]
     return lead_with_doubt(Result(title, verdict, headline, figures, remarks, details, tables))
 
@@ -245,16 +239,19 @@ def _gains_table(summary: JsonObject) -> ResultTable:
     return ResultTable("Gains", ["gain", "value", "over f⁺, λ over √f⁺", "a smaller one", "a larger one"], rows)
 
 
-def _comparison_table(heading: str, gains: list[JsonObject]) -> ResultTable:
+def _comparison_table(holdout: JsonObject) -> ResultTable:
+    """The gains that were compared on the held-out runs, those of the motor first."""
+    held_out = f"the held-out excitation ({holdout['excitation']['kind']})"
+    where = "the study's excitation with other noise" if holdout["same_excitation"] else held_out
     rows = [
         [*(row[key] for key in ("side", "name", "lambda", "alpha")), 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
          row["convergence_time"]["worst"], *(row[key] for key in _MARGINS.values())]
-        for row in sorted(gains, key=lambda row: row["side"] != "motor")
+        for row in sorted(holdout["rows"], key=lambda row: row["side"] != "motor")
     ]  # fmt: skip
     columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
                "median", "convergence (s)", *_MARGINS]  # fmt: skip
-    return ResultTable(heading, columns, rows)
+    return ResultTable(f"On {where}, worst and median of all runs", columns, rows)
 
 
 ASSUMPTIONS = (
