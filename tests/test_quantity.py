@@ -78,10 +78,10 @@ def test_a_file_keeps_a_quantity_and_leaves_out_what_there_is_not(value, error, 
 
 def test_a_table_leaves_out_columns_without_a_number():
     numbers = {"a": Quantity(1.0, math.nan, unit="rad"), "b": Quantity(2.0, 0.1, unit="s")}
-    table = number_table("Numbers", numbers)
+    table = number_table("Numbers", {path: number.to_dict() for path, number in numbers.items()})
     assert table.columns == ["path", "value", "standard error", "unit"]
     assert table.rows == [["a", 1.0, None, "rad"], ["b", 2.0, 0.1, "s"]]
-    full = number_table("Numbers", {"a": Quantity(1.0, 0.1, (0.8, 1.2), "rad", 0.9)})
+    full = number_table("Numbers", {"a": Quantity(1.0, 0.1, (0.8, 1.2), "rad", 0.9).to_dict()})
     assert full.columns == ["path", "value", "standard error", "95 % from", "to", "unit", "nominal"]
     assert full.rows == [["a", 1.0, 0.1, 0.8, 1.2, "rad", 0.9]]
 

@@ -1,6 +1,6 @@
 """What `jaxbl bench` leaves: table, `bench.json`, a bar chart, and throughput against lanes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,12 +12,6 @@ from jaxbl.throughput.run import CPP_NAME, FUSED_NAME, PRECISIONS, SCAN_NAME, Be
 
 from .drawing import save
 from .panels import BLUE, GREEN, VERMILION, Axis, Bars, Figure, Line, Panel
-
-
-def draw_throughput(result: BenchResult) -> list[Figure]:
-    """The figures of a benchmark."""
-    return [_bars(result), _curve(result)]
-
 
 _SPEED = Axis("lane-steps per second", log=True)
 
@@ -69,16 +63,15 @@ def _align(rows: Iterable[Sequence[str]]) -> Lines:
     return pd.DataFrame(rows).to_string(header=False, index=False).split("\n")
 
 
-def _table(result: BenchResult, precision: str) -> list[list[str]]:
+def _table(result: BenchResult, precision: str) -> Iterator[list[str]]:
     """Header and rows of the table of one precision, as text."""
-    rows = [[precision, "lanes", "best", "median", "of C++", "first", "off by"]]
+    yield [precision, "lanes", "best", "median", "of C++", "first", "off by"]
     ceiling = result.find_speed(CPP_NAME, precision)
     for row in result.rows:
         if row.precision == precision:
             share = f"{row.lane_steps_per_second / ceiling:.2g}" if ceiling else "–"
             speeds = f"{row.lane_steps_per_second:.3g}", f"{row.median_lane_steps_per_second:.3g}", share
-            rows.append([row.name, str(row.lanes), *speeds, f"{row.first_seconds:.2f} s", f"{row.deviation:.1g}"])
-    return rows
+            yield [row.name, str(row.lanes), *speeds, f"{row.first_seconds:.2f} s", f"{row.deviation:.1g}"]
 
 
 def throughput_lines(result: BenchResult) -> Lines:
@@ -103,6 +96,6 @@ def throughput_lines(result: BenchResult) -> Lines:
 def write_bench_report(result: BenchResult, folder: Path) -> Lines:
     """Write `bench.json` and figures into a folder that exists. Returns the lines for the terminal."""
     write_json(folder / "bench.json", asdict(result))
-    for figure in draw_throughput(result):
+    for figure in (_bars(result), _curve(result)):
         save(figure, folder / "figures" / f"{figure.name}.png")
     return throughput_lines(result)

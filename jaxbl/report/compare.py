@@ -5,6 +5,7 @@
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,9 @@ def tabulate_points(comparison: Comparison) -> pd.DataFrame:
     for change in comparison.metrics:
         if change.count:
             frame = comparison.frame(change.metric)
-            columns |= {path: frame[path] for path in comparison.axes}
             numbers = frame[["first", "second"]].astype(float)
             numbers.insert(0, "factor", _divide(numbers, change.metric))
-            columns |= {f"{change.metric}.{name}": column for name, column in numbers.items()}
+            columns |= {**frame[[*comparison.axes]], **numbers.add_prefix(f"{change.metric}.")}
     return pd.DataFrame(columns)
 
 
@@ -113,7 +113,7 @@ def _ways(change: MetricChange) -> str:
 def _split(change: MetricChange) -> tuple[int, int]:
     """At how many points a metric is better and worse, or larger and smaller where neither is better."""
     up, down = change.up, change.count - change.up
-    return (down, up) if change.better and change.better != "more" else (up, down)
+    return (down, up) if change.better == "less" else (up, down)
 
 
 def _factor(change: MetricChange) -> str:
@@ -125,7 +125,7 @@ def _factor(change: MetricChange) -> str:
     return f"{value} ({' to '.join(interval)})" if interval else value
 
 
-def draw(comparison: Comparison) -> list[Figure]:
+def draw(comparison: Comparison) -> Iterator[Figure]:
     """Mean and spread of the factor of each metric that changed and has one; nothing where there is none."""
     rows = {}
     for change in sorted(comparison.metrics, key=lambda change: not change.better):
@@ -135,12 +135,13 @@ def draw(comparison: Comparison) -> list[Figure]:
         if factor.gt(0.0).any():
             rows[value_label(change.metric)] = factor.quantile(0.05), change.moved.value, factor.quantile(0.95)
     if not rows:
-        return []
-    names, factors = [*rows][:_ROWS], np.array([*rows.values()][:_ROWS]).T
-    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(range(len(names)), *factors, colour=BLUE)]
+        return
+    factors = pd.DataFrame(rows).iloc[:, :_ROWS]
+    names = [*factors]
+    parts = [Span(1.0, 1.0, "no change", dashes="-"), *intervals(range(len(names)), *factors.to_numpy(), colour=BLUE)]
     caption = "Factor from the first study to the second: geometric mean of all points, and the range of nine in ten."
     x = Axis("factor from the first study to the second", log=True)
-    return [Figure("factors", [Panel(x, name_rows(names), parts)], caption, height=0.9 + 0.3 * len(names))]
+    yield Figure("factors", [Panel(x, name_rows(names), parts)], caption, height=0.9 + 0.3 * len(names))
 
 
 def _divide(frame: pd.DataFrame, metric: str) -> Any:

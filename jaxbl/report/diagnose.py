@@ -1,6 +1,6 @@
 """What `jaxbl diagnose` leaves to be read: missing effects, their probability, and model errors before and after."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxbl.diagnosis.proof import ACTS
 from jaxbl.diagnosis.residuals import Residual, narrow
 from jaxbl.diagnosis.sentences import sentence_of
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import DOUBT, Lines, percent
+from jaxbl.lines import DOUBT, percent
 from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.records.least_squares import rms
 from jaxbl.result import KeyFigure, Result, ResultTable
@@ -52,89 +52,82 @@ def describe(summary: JsonObject) -> Result:
     tables = [
         *[_history_table(summary)] * bool(summary["history"]),
         _gap_table(summary["gap"]),
-        number_table("Parameters of the model", read_quantities(summary["parameters"])),
+        number_table("Parameters of the model", summary["parameters"]),
     ]
     title = summary["title"] or f"Diagnosis of {Path(summary['file']).name}"
     where = summary["where"] if summary["verdict"] != "unknown_effect" or summary["findings"] else {}
     residuals = (f"Residual of the model as given: {side['sentence']}." for side in where.values())
     details = [_held_out_sentence(summary["gap"]["holdout"]), *residuals, *summary["notes"]]
-    return lead_with_doubt(Result(title, verdict, headline, _key_figures(summary), _reasons(summary), details, tables))
+    figures, remarks = [*_key_figures(summary)], [*_reasons(summary)]
+    return lead_with_doubt(Result(title, verdict, headline, figures, remarks, details, tables))
 
 
 _FAR = 10.0
 """Torque over what [log] u says, from which on a unit is rather wrong."""
 
 
-def _key_figures(summary: JsonObject) -> list[KeyFigure]:
+def _key_figures(summary: JsonObject) -> Iterator[KeyFigure]:
     """Errors of torque and position on held-out data, and the least certain of the likely effects."""
-    gap, figures = summary["gap"], []
+    gap = summary["gap"]
     errors = _errors_of_channels(gap)
     for channels in (("torque_motor", "torque_load"), ("theta_e", "theta_s")):
         if there := [name for name in channels if name in errors]:
             name = max(there, key=lambda name: _ratio(errors[name][0], errors[name][2]))
             before, after, _, limit = errors[name]
             change = f"{rms_text(before)} → {rms_text(after)} {gap['units'][name]}"
-            figures.append(KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (limit {rms_text(limit)})"))
+            yield KeyFigure(change, f"{_CHANNELS[name]}: rms error on held-out data (limit {rms_text(limit)})")
     if summary["findings"]:
         finding = min(summary["findings"], key=lambda finding: (not finding["likely"], finding["confidence"]))
         leaf, number = next(iter(read_quantities(finding["parameters"]).items()))
-        figures += [
-            KeyFigure(str(number), f"{finding['effect']}: {leaf}"),
-            KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}"),
-        ]
+        yield KeyFigure(str(number), f"{finding['effect']}: {leaf}")
+        yield KeyFigure(probability(finding["confidence"]), f"confidence that it is {finding['effect']}")
     elif summary.get("numbers_off"):
         numbers = {path: number for path, number in read_quantities(summary["parameters"]).items() if number.factor > 0.0}
         if numbers:
             path, number = max(numbers.items(), key=lambda named: abs(np.log(named[1].factor)))
-            figures.append(KeyFigure(str(number), f"{path}, {number.nominal:g} in the model: furthest off"))
-    return figures
+            yield KeyFigure(str(number), f"{path}, {number.nominal:g} in the model: furthest off")
 
 
-def _reasons(summary: JsonObject) -> Lines:
+def _reasons(summary: JsonObject) -> Iterator[str]:
     """Say what stands against the answer, and what each effect is like."""
-    doubts, lines = [], []
+    if summary["contradictions"]:
+        yield _contradiction_sentence(summary["contradictions"])
+    yield from summary["warnings"]
     for finding in summary["findings"]:
-        numbers, alternatives = read_quantities(finding["parameters"]), finding["alternatives"]
-        gain = 1.0 + numbers["relative"].value if "relative" in numbers else 1.0
-        if not 1.0 / _FAR < gain < _FAR:
-            doubts.append(
-                f"{DOUBT}the torque would be {gain:.3g} times what u says: a unit, a factor or a sign in [log] may be wrong."
-            )
-        texts = ", ".join(f"{leaf} = {number}" for leaf, number in numbers.items())
-        z = finding.get("holdout_z")
+        change = finding["parameters"].get("relative")
+        if change and not 1.0 / _FAR < (gain := 1.0 + Quantity.read(change).value) < _FAR:
+            doubt = f"{DOUBT}the torque would be {gain:.3g} times what u says"
+            yield f"{doubt}: a unit, a factor or a sign in [log] may be wrong."
+    if left := _sentence_on_the_rest(summary):
+        yield left
+    for finding in summary["findings"]:
+        texts = ", ".join(f"{leaf} = {number}" for leaf, number in read_quantities(finding["parameters"]).items())
         support = ""
-        if z is not None:
+        if (z := finding.get("holdout_z")) is not None:
             way = "better" if z > 0.0 else "worse"
             support = f"; held-out data are predicted {way} with it, by {abs(z):.1f} standard errors"
-        lines.append(
+        yield (
             f"{finding['effect']} (confidence {probability(finding['confidence'])}): {texts}; "
             f"{finding.get('in_log') or percent(finding['share']) + ' of the driving torque'}{support}."
         )
-        if alternatives:
+        if alternatives := finding["alternatives"]:
             names = ", ".join(f"{other['effect']} ({probability(other['confidence'])})" for other in alternatives)
-            lines.append(f"Not ruled out by this log in place of {finding['effect']}: {names}.")
-    return [
-        *_contradiction_lines(summary),
-        *summary["warnings"],
-        *doubts,
-        *_record_lines(summary),
-        *lines,
-        *_failed_checks(summary),
-        *_table_lines(summary),
-    ]
+            yield f"Not ruled out by this log in place of {finding['effect']}: {names}."
+    yield from _failed_checks(summary)
+    if added := summary.get("torque_tables"):
+        yield _tables_sentence(added)
 
 
-def _contradiction_lines(summary: JsonObject) -> Lines:
-    """Numbers that the logs do not agree on."""
+def _contradiction_sentence(contradictions: list[JsonObject]) -> str:
+    """Name the numbers that the logs do not agree on."""
     numbers = []
-    for number in summary["contradictions"]:
+    for number in contradictions:
         values = [f"{Quantity.read(by_log | {'unit': number['unit']})} by {by_log['log']}" for by_log in number["logs"]]
         numbers.append(f"{number['parameter']} is {' and '.join(values)}")
-    sentence = (
+    return (
         f"By the logs {'; '.join(numbers)}. Was the load, the controller (a feedforward that u does not contain) or a unit "
         "another one?"
     )
-    return [sentence] if numbers else []
 
 
 _AS_WELL = "predicts new data as well as noise and the stated uncertainties allow"
@@ -178,14 +171,14 @@ def _verdict(summary: JsonObject) -> tuple[str, str]:
     )
 
 
-def _record_lines(summary: JsonObject) -> Lines:
+def _sentence_on_the_rest(summary: JsonObject) -> str:
     """Say where something is left, or what to record where the proof could not test the model."""
     gap = summary["gap"]
     if summary["verdict"] == "unknown_effect":
         where = summary.get("where_after", summary["where"])
-        return [f"What is left: {'; '.join(side['sentence'] for side in where.values())}."]
+        return f"What is left: {'; '.join(side['sentence'] for side in where.values())}."
     if summary["verdict"] != "not_tested":
-        return []
+        return ""
     units = gap["units"]
     effects = {name: torque for name, torque in gap["test"]["untested"].items() if torque}
     torques = [
@@ -198,26 +191,23 @@ def _record_lines(summary: JsonObject) -> Lines:
         # it acts there, but less than a complete model may leave
         if all(torque["torque"] > ACTS * torque["on_log"] for torque in effects.values()):
             way = "a motion in which it is a larger part of the torque, or one that is read with less noise"
-            return [f"{lead} Hold out {way}."]
+            return f"{lead} Hold out {way}."
     reached = ", ".join(
         f"{_CHANNELS[name].removesuffix(': missing torque')}{' torque' if name.startswith('torque') else ''} "
         f"{rms_text(reach['log'])} {units[name]} (there {rms_text(reach['proof'])})"
         for name, reach in gap["range"].items()
     )
-    return [f"{lead} Hold out a log that reaches as far: {reached}."]
+    return f"{lead} Hold out a log that reaches as far: {reached}."
 
 
-def _table_lines(summary: JsonObject) -> Lines:
+def _tables_sentence(added: JsonObject) -> str:
     """Say what tables of torques without a name add."""
-    if "torque_tables" not in summary:
-        return []
-    added = summary["torque_tables"]
     torques = [
         f"{side} torque over {_join_words([table['over'].replace('turn', 'position within a turn') for table in tables])}"
         for side, tables in added["tables"].items()
     ]
     than = "" if added["holdout_z"] > 0.0 else ", which predict held-out data no better"
-    return [f"Not named, but in model.toml as tables: {_join_words(torques)}{than}."]
+    return f"Not named, but in model.toml as tables: {_join_words(torques)}{than}."
 
 
 def _join_words(words: Sequence[str]) -> str:
@@ -225,27 +215,28 @@ def _join_words(words: Sequence[str]) -> str:
     return ", ".join([*words[:-2], " and ".join(words[-2:])])
 
 
-def _failed_checks(summary: JsonObject) -> Lines:
+def _failed_checks(summary: JsonObject) -> Iterator[str]:
     """Say why a model does not count as complete, one line each."""
-    gap, test, lines, over = summary["gap"], summary["gap"]["test"], [], {}
+    gap, test, over = summary["gap"], summary["gap"]["test"], {}
     left = {name: (after, limit) for name, (_, after, _, limit) in _errors_of_channels(gap).items()}
     # of each channel the test that shows it best
     for name in sorted(test["failed"], key=lambda name: -_ratio(*left[name])):
         channel, (error, limit) = name.split()[0], map(rms_text, left[name])
         over.setdefault(channel, f"{name} {error} {gap['units'][channel]} (at most {limit})")
     if over:
-        lines.append(
+        yield (
             "More is left than noise, the uncertainty of the numbers and torques too small to be named account for "
             f"({100.0 * test['level']:.0f} % test): {'; '.join(over.values())}."
         )
     for path, z in test["far"].items():
         number = Quantity.read(summary["parameters"][path])
         change = f" to {number.factor:.3g} times its nominal value" if number.nominal else ""
-        lines.append(
+        yield (
             f"{path} had to change{change}, {abs(z):.0f} times its [uncertainty]; this number and the effects found may "
             "offset each other. Check the noise of u, or raise [uncertainty] relative."
         )
-    return [*lines, f"{CHECKS['little']}."] if test["little"] else lines
+    if test["little"]:
+        yield f"{CHECKS['little']}."
 
 
 def probability(value: float) -> str:
@@ -299,16 +290,15 @@ def _gap_table(gap: JsonObject) -> ResultTable:
     return ResultTable("Held-out data, rms", ["channel", "unit", "before", "after", "noise", "complete model at most"], rows)
 
 
-def draw(diagnosis: Diagnosis) -> list[Figure]:
+def draw(diagnosis: Diagnosis) -> Iterator[Figure]:
     """All figures of a diagnosis."""
     if not diagnosis.located:
-        return [draw_motor_alone(diagnosis)]
+        yield draw_motor_alone(diagnosis)
+        return
+    yield _over_time(diagnosis)
     unit = diagnosis.record.unit_of("motor.torque", "N m")
-    over = [
-        draw_residual(parts, diagnosis.coordinates[side], diagnosis.located[side], unit)
-        for side, parts in diagnosis.residuals.items()
-    ]
-    return [_over_time(diagnosis), *over]
+    for side, parts in diagnosis.residuals.items():
+        yield draw_residual(parts, diagnosis.coordinates[side], diagnosis.located[side], unit)
 
 
 def _over_time(diagnosis: Diagnosis) -> Figure:

@@ -1,6 +1,6 @@
 """Gains of an observer against the gain conditions, in the units of a user's drive: the atlas of `verify` at one f⁺."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import jax
 import numpy as np
@@ -74,21 +74,24 @@ def say_thin_reserve(reserves: Mapping[str, float]) -> str:
 _GAINS = "lambda", "alpha", "f_plus", "largest_f_plus"
 
 
-def conditions_line(side: str, judged: JsonObject, source: str) -> str:
-    """Say whether a side's gains are safe at an f⁺ (`source` says whose), how far from where the exact condition fails."""
-    lambda_, alpha, bound, largest = (judged[key] for key in _GAINS)
-    lead = f"{side}: f⁺ = {bound:.3g} rad/s² is {source};"
-    if bound == 0.0:
-        return f"{lead} nothing disturbs the observer, and any λ > 0 is enough."
-    if not judged["alpha_exceeds_f_plus"]:
-        return f"{lead} α = {alpha:.3g} rad/s² is too small, as it has to exceed f⁺."
-    least = judged["least_lambda"]["exact"]
-    if not judged["holds"]["exact"]:
-        return f"{lead} λ = {lambda_:.3g} √rad/s is too small: it has to exceed {least:.3g} (exact condition)."
-    return (
-        f"{lead} the exact condition holds. λ may fall to {least:.3g} √rad/s ({lambda_ / least:.4g} times less), or f⁺ "
-        f"grow to {largest:.3g} rad/s² ({largest / bound:.4g} times more), until it fails."
-    )
+def describe_conditions(judged: Mapping[str, JsonObject], source: str = "the largest of all runs") -> Iterator[str]:
+    """Say whether each side has safe gains at an f⁺ (of `source`), and how far they are from where the exact condition
+    fails."""
+    for side, gains in judged.items():
+        lambda_, alpha, bound, largest = (gains[key] for key in _GAINS)
+        least = gains["least_lambda"]["exact"]
+        lead = f"{side}: f⁺ = {bound:.3g} rad/s² is {source};"
+        if bound == 0.0:
+            yield f"{lead} nothing disturbs the observer, and any λ > 0 is enough."
+        elif not gains["alpha_exceeds_f_plus"]:
+            yield f"{lead} α = {alpha:.3g} rad/s² is too small, as it has to exceed f⁺."
+        elif not gains["holds"]["exact"]:
+            yield f"{lead} λ = {lambda_:.3g} √rad/s is too small: it has to exceed {least:.3g} (exact condition)."
+        else:
+            yield (
+                f"{lead} the exact condition holds. λ may fall to {least:.3g} √rad/s ({lambda_ / least:.4g} times less), or "
+                f"f⁺ grow to {largest:.3g} rad/s² ({largest / bound:.4g} times more), until it fails."
+            )
 
 
 def draw_gain_plane(side: str, judged: JsonObject) -> Figure:

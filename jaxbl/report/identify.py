@@ -1,7 +1,7 @@
 """What `jaxbl identify` leaves to be read: numbers with intervals, and what the log shows of motion, torque and gap."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ def describe(summary: JsonObject) -> Result:
         verdict = "doubtful"
         headline = f"The model does not explain the log, so its numbers may be wrong: more than noise is left ({size})."
     heading, rejected = "Parameters", summary.get("rejected")
-    profiles = {path: number.get("profile_interval") for path, number in summary["parameters"].items()}
+
     remarks = [*summary["warnings"], *_far_off(parameters)]
     if rejected:
         heading = "Parameters of a fit that leaves more than noise"
@@ -66,9 +66,8 @@ def describe(summary: JsonObject) -> Result:
     remarks += [f"{path}: not identifiable from this log." for path in parameters if path not in numbers]
     title = summary["title"] or f"Identification from {Path(summary['file']).name}"
     figures = [*_backlash(summary), *number_figures(numbers)][:4]
-    return lead_with_doubt(
-        Result(title, verdict, headline, figures, remarks, _remarks(summary), [number_table(heading, parameters, profiles)])
-    )
+    tables = [number_table(heading, summary["parameters"])]
+    return lead_with_doubt(Result(title, verdict, headline, figures, remarks, [*_details(summary)], tables))
 
 
 _FAR = 10.0
@@ -86,50 +85,53 @@ def _far_off(parameters: Mapping[str, Quantity]) -> Lines:
     return [f"{DOUBT}{', '.join(far)}: a unit, a factor or a sign in [log] may be wrong."] if far else []
 
 
-def _backlash(summary: JsonObject) -> list[KeyFigure]:
+def _backlash(summary: JsonObject) -> Iterator[KeyFigure]:
     """Say what a log without the load's encoder shows of a gap."""
     gap = summary.get("backlash")
-    if gap is None:
-        return []
-    if not gap["shown"]:
-        return [KeyFigure("No gap is shown", gap["why"])]
-    unit, count = summary["residual"]["motor"]["unit"], gap["crossings"]
-    meaning = f"half gap at the motor, from {count} crossings; without it its readings cannot be met"
-    return [KeyFigure(f"{gap['half_gap']:.4g} {unit}", meaning)]
+    if gap and gap["shown"]:
+        unit, count = summary["residual"]["motor"]["unit"], gap["crossings"]
+        meaning = f"half gap at the motor, from {count} crossings; without it its readings cannot be met"
+        yield KeyFigure(f"{gap['half_gap']:.4g} {unit}", meaning)
+    elif gap:
+        yield KeyFigure("No gap is shown", gap["why"])
 
 
-def _remarks(summary: JsonObject) -> Lines:
-    fit, unseen = summary["method"]["trajectory"], (summary.get("backlash") or {}).get("why")
-    lines = []
+def _details(summary: JsonObject) -> Iterator[str]:
+    """Say what cannot be identified, how the fit was made, and what it leaves."""
+    fit, gap = summary["method"]["trajectory"], summary.get("backlash")
     for refusal in summary["refused"]:
         shares = ", ".join(f"{path} {share:+.2f}" for path, share in refusal["direction"].items())
-        lines.append(refusal["why"] != unseen and f"Not identifiable: {shares}: {refusal['why']}.")
+        # what the gap's figure says already is left out
+        if not gap or refusal["why"] != gap["why"]:
+            yield f"Not identifiable: {shares}: {refusal['why']}."
+    if summary["held"]:
+        yield f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}."
+    meanings = ["the model is incomplete", "noise alone"]
     how = (
         f"{fit['windows']} windows of {fit['window']:.3g} s with free initial states; {fit['starts_agreeing']} of "
         f"{fit['starts']} starts agree."
     )
-    residuals, meanings = summary["residual"].items(), ["the model is incomplete", "noise alone"]
     if "backlash" in summary:
         how = "Fitted to the prediction errors of the motor over all of the log; the load moves as the model says."
         meanings[0] = "noise of the torque, or something that the model lacks"
-    lines += [
-        summary["held"] and f"Held at the nominal value, which the other numbers depend on: {', '.join(summary['held'])}.",
-        *(f"{side}: position residual {_size(residual)}: {meanings[is_noise(residual)]}." for side, residual in residuals),
-        how,
-        not fit["converged"] and "The fit stopped before it reached its tolerance.",
-        summary["torque"] and f"Torque error of the model, rms: {_shares(summary['torque'])}.",
-    ]
+    for side, residual in summary["residual"].items():
+        yield f"{side}: position residual {_size(residual)}: {meanings[is_noise(residual)]}."
+    yield how
+    if not fit["converged"]:
+        yield "The fit stopped before it reached its tolerance."
+    if summary["torque"]:
+        yield f"Torque error of the model, rms: {_shares(summary['torque'])}."
     for side, gains in summary.get("gains", {}).items():
         error = gains["velocity_error"]
-        lines.append(
+        yield (
             f"{side} observer: no gains that were tried follow the log; those in model.toml do not, either."
             if error is None
             else f"{side} observer: lambda = {gains['lambda_']:.3g}, alpha = {gains['alpha']:.3g}, chosen on the log for "
             f"f⁺ = {gains['f_plus']:.3g}; its velocity differs from the smoothed one by {error:.2g} rms."
         )
     if "holdout" in summary:
-        lines += _on_holdout(summary["holdout"])
-    return [*filter(None, lines), *summary["notes"]]
+        yield from _on_holdout(summary["holdout"])
+    yield from summary["notes"]
 
 
 def _size(residual: JsonObject) -> str:
@@ -146,17 +148,16 @@ def _share(error: JsonObject, model: str = "") -> str:
     return f"{error[f'{model}rms']:.2g} {error['unit']} rms" if relative is None else percent(relative)
 
 
-def _on_holdout(holdout: JsonObject) -> Lines:
+def _on_holdout(holdout: JsonObject) -> Iterator[str]:
     name = Path(holdout["file"]).name
-    lines = [
-        f"On {name}, {side}: position residual over {holdout['window']:.3g} s {_size(residual)}; with the nominal numbers "
-        f"{residual['nominal_rms']:.2g}."
-        for side, residual in holdout["position"].items()
-    ]
+    for side, residual in holdout["position"].items():
+        yield (
+            f"On {name}, {side}: position residual over {holdout['window']:.3g} s {_size(residual)}; with the nominal "
+            f"numbers {residual['nominal_rms']:.2g}."
+        )
     if holdout["torque"]:
         before = ", ".join(_share(error, "nominal_") for error in holdout["torque"].values())
-        lines.append(f"On {name}, torque error rms: {_shares(holdout['torque'])}; with the nominal numbers {before}.")
-    return lines
+        yield f"On {name}, torque error rms: {_shares(holdout['torque'])}; with the nominal numbers {before}."
 
 
 _SETTLING = 0.1
@@ -217,13 +218,16 @@ class LogSignals:
         return estimate + self.low_passed(self[effects]) / float(self.plant.drive.torque_gain(side))
 
 
-def draw(result: Identification) -> list[Figure]:
+def draw(result: Identification) -> Iterator[Figure]:
     """All figures of an identification."""
     if "backlash" in result.summary:
-        return [draw_motor_alone(result), _residuals(result)]
-    # a load with an encoder of its own has a twist
-    first = _hysteresis if "twist" in result.trace else _friction
-    return [first(LogSignals(result)), _residuals(result)]
+        yield draw_motor_alone(result)
+    elif "twist" in result.trace:
+        # of a load with an encoder of its own
+        yield _hysteresis(LogSignals(result))
+    else:
+        yield _friction(LogSignals(result))
+    yield _residuals(result)
 
 
 def _residuals(result: Identification) -> Figure:
@@ -244,20 +248,20 @@ def _residuals(result: Identification) -> Figure:
     )
 
 
-def _means(log: LogSignals, x: Array, torque: Array, rate: Array, name: str, span: Pair | None) -> list[Line]:
+def _means(log: LogSignals, x: Array, torque: Array, rate: Array, name: str, span: Pair | None) -> Iterator[Line]:
     """Settled samples of a torque over x, as far as it goes, and their means for both signs of its rate, in bins of at least
     four samples."""
     if span is None:
-        return []
+        return
     x, torque, rate = (signal[log.settled] for signal in (x, torque, rate))
-    lines, finite, grows = [cloud(x, torque)], np.isfinite(torque), rate > 0.0
+    yield cloud(x, torque)
+    finite, grows = np.isfinite(torque), rate > 0.0
     for word, colour, rows in (("growing", GREEN, finite & grows), ("falling", PURPLE, finite & ~grows)):
         bins = int(np.clip(np.sum(rows) // 15, 24, 80))
         count, edges = np.histogram(x[rows], bins, span)
         total, _ = np.histogram(x[rows], bins, span, weights=torque[rows])
         mean = np.where(count >= 4, total / np.maximum(count, 1), np.nan)
-        lines.append(Line(0.5 * (edges[1:] + edges[:-1]), mean, f"mean, {name} {word}", colour, 2.4, opacity=0.9))
-    return lines
+        yield Line(0.5 * (edges[1:] + edges[:-1]), mean, f"mean, {name} {word}", colour, 2.4, opacity=0.9)
 
 
 def _hysteresis(log: LogSignals) -> Figure:
@@ -295,7 +299,7 @@ def _friction(log: LogSignals) -> Figure:
     velocity, quantity = log.low_passed(log["motor.velocity"]), missing_quantity(unit)
     across = limits(velocity[rows])
     # a line of the observer's own torque, which chatters, would fill the panel
-    parts = _means(log, velocity, estimate, np.gradient(velocity), "velocity", across)
+    parts = [*_means(log, velocity, estimate, np.gradient(velocity), "velocity", across)]
     if "motor.effects" in log.trace:
         parts.append(Line(velocity[rows], log.low_passed(log["motor.effects"])[rows], "fitted effects", width=1.2))
     x = Axis(f"velocity by the smoother ({log.unit}/s)", ends=across)

@@ -1,5 +1,6 @@
 """Figures, table and report of an inspected log."""
 
+from collections.abc import Iterator
 from dataclasses import astuple
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from jaxbl.records.inspection import compute_velocity, main_side
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .numbers import lead_with_doubt
-from .panels import BLACK, BLUE, COLOURS, GREEN, PURPLE, VERMILION, Axis, Figure, Panel, cloud, draw_signals
+from .panels import BLACK, BLUE, COLOURS, GREEN, PURPLE, VERMILION, Array, Axis, Figure, Panel, cloud, draw_signals
 
 _LOOKS = {
     "u": ("input u", BLACK), "theta_e": ("motor θe", BLUE), "theta_s": ("load θs", VERMILION),
@@ -62,16 +63,18 @@ def _channel_table(record: Record) -> ResultTable:
     columns = ["channel", "unit", "least", "largest", "resolution", "noise", "bandwidth (Hz)", "saturated (share)", "jumps",
                "skew (ms)", "standard error (ms)"]  # fmt: skip
     rows = []
-    for name, c in record.statistics.channels.items():
-        skew = [None if seconds is None else 1e3 * seconds for seconds in (c.skew, c.skew_error)]
-        positions = c.jumps if name.startswith("theta") else None
-        rows.append([name, *(getattr(c, key) for key in columns[1:6]), c.bandwidth, c.saturated, positions, *skew])
+    for name, channel in record.statistics.channels.items():
+        *statistics, jumps, skew, skew_error = astuple(channel)
+        times = [None if seconds is None else 1e3 * seconds for seconds in (skew, skew_error)]
+        rows.append([name, *statistics, jumps if name.startswith("theta") else None, *times])
     return ResultTable("Channels", columns, rows)
 
 
-def draw(inspection: Inspection) -> list[Figure]:
+def draw(inspection: Inspection) -> Iterator[Figure]:
     """All figures of an inspected log."""
-    return [_channels(inspection.record), *([] if inspection.twist is None else [_twist(inspection)])]
+    yield _channels(inspection.record)
+    if inspection.twist is not None:
+        yield _twist(inspection, inspection.twist)
 
 
 def _channels(record: Record) -> Figure:
@@ -89,10 +92,9 @@ def _channels(record: Record) -> Figure:
     return Figure("channels", draw_signals(record.time, record.segments, signals), caption, height=1.5)
 
 
-def _twist(inspection: Inspection) -> Figure:
-    record, twist = inspection.record, inspection.twist
-    assert twist is not None
-    channels, gearing = record.statistics.channels, record.statistics.gearing
+def _twist(inspection: Inspection, twist: Array) -> Figure:
+    record, channels = inspection.record, inspection.record.statistics.channels
+    gearing = record.statistics.gearing
     over = [(record.positions["load"], f"load position θs ({channels['theta_s'].unit})")]
     name, torque = ("u", record.torque) if record.transmitted is None else ("transmitted", record.transmitted)
     if torque is not None and np.ptp(torque):

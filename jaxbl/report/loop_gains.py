@@ -7,11 +7,12 @@ from pathlib import Path
 
 import tomli_w
 
+from jaxbl.files import write_atomic
 from jaxbl.gains.loop_gains import LoopTuning
 from jaxbl.gains.stages import set_keys
 from jaxbl.json_types import JsonObject
 from jaxbl.result import KeyFigure, Result, ResultTable
-from jaxbl.sweeps.metrics import find_metric
+from jaxbl.sweeps.metrics import Metric, find_metric
 
 from .maps import axis_label
 from .panels import BLUE, Axis, Figure, Panel, arrange, cloud, mark, with_unit
@@ -20,8 +21,7 @@ from .tune import for_title
 
 def draw(tuning: LoopTuning) -> list[Figure]:
     """Draw the error of all candidates over each gain."""
-    summary, candidates, panels = tuning.summary, tuning.candidates, []
-    metric = find_metric(summary["objective_metric"].split()[0])
+    summary, candidates, metric, panels = tuning.summary, tuning.candidates, _find_objective(tuning), []
     for path, gain in summary["gains"].items():
         parts = [
             cloud(candidates[path], candidates["error"], "tried", BLUE, marker="o", size=3.0),
@@ -34,6 +34,10 @@ def draw(tuning: LoopTuning) -> list[Figure]:
     return [Figure("loop_gains", panels, caption, columns, 3.6 * columns, 3.2)]
 
 
+def _find_objective(tuning: LoopTuning) -> type[Metric]:
+    return find_metric(tuning.summary["objective_metric"].split()[0])
+
+
 def write(tuning: LoopTuning, folder: Path) -> None:
     """Write `gains.toml`."""
     summary = tuning.summary
@@ -41,30 +45,29 @@ def write(tuning: LoopTuning, folder: Path) -> None:
         f"# Gains of a loop chosen by 'jaxbl tune'{for_title(summary)}\n# Objective: {summary['objective_metric']}.\n"
         '# To use them, put include = "gains.toml" at the top of a study and leave its own gains out.\n\n'
     )
-    (folder / "gains.toml").write_text(head + tomli_w.dumps(set_keys({}, summary["gains"])), encoding="utf-8")
+    write_atomic(folder / "gains.toml", head + tomli_w.dumps(set_keys({}, summary["gains"])))
 
 
 def describe(tuning: LoopTuning) -> Result:
     """Say by how much the loop is better, and how far each gain is from where it no longer holds."""
-    summary, compared = tuning.summary, tuning.summary["compared"]
-    name, unit = summary["objective_metric"].split(" ", 1)
-    label, ranking = find_metric(name).label, summary["ranking"]
-    tuned, study = ranking["tuned"], ranking.get("study", {"error": None})
-    verdict, headline = "good", f"Take these gains of the loop: {label} {tuned['error'] or float('inf'):.3g} {unit[1:-1]}."
+    summary, compared, metric = tuning.summary, tuning.summary["compared"], _find_objective(tuning)
+    # the study's own gains are not compared where they are the best ones
+    tuned, study, remarks = summary["ranking"]["tuned"], summary["ranking"].get("study"), []
     if tuned["error"] is None:
         verdict, headline = "failed", "The gains fail under other noise: the loop diverges or does not settle in some run."
-    elif study["error"] is None and "study" in compared:
-        headline += " With the study's own the loop diverges or does not settle."
-    elif tuned["ratio"] > 1.0 or "study" not in compared:
+    elif study is None or tuned["ratio"] > 1.0:
         verdict, headline = "doubtful", "No gains tried are better than the study's own."
-    figures = [KeyFigure(f"{gain:.4g}", path) for path, gain in list(summary["gains"].items())[:4]]
-    remarks = []
-    if study["error"] and tuned["error"]:
+    else:
+        verdict, headline = "good", f"Take these gains of the loop: {metric.label} {tuned['error']:.3g} {metric.unit}."
+        if study["error"] is None:
+            headline += " With the study's own the loop diverges or does not settle."
+    if study and study["error"] and tuned["error"]:
         remarks.append(f"With the study's own gains it is {study['ratio']:.3g} times as much.")
     if ends := summary["at_range_end"]:
         remarks.append(f"Best at an end of the range searched: {', '.join(ends)}. Beyond it may be better ones.")
-    numbers = [row["gains"] | {key: value for key, value in row.items() if key != "gains"} for row in compared.values()]
-    rows = [[key, *(row[key] for row in numbers)] for key in numbers[0]]
+    figures = [KeyFigure(f"{gain:.4g}", path) for path, gain in list(summary["gains"].items())[:4]]
+    numbers = [row["gains"] | row for row in compared.values()]
+    rows = [[key, *(row[key] for row in numbers)] for key in numbers[0] if key != "gains"]
     tables = [
         ResultTable("Gains, and the worst of held-out runs", ["", *compared], rows), margin_table(summary["margins"])
     ]  # fmt: skip

@@ -1,6 +1,6 @@
 """Numbers that were found in a log: as key figures, as rows of a table, and as files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,9 +8,10 @@ from typing import Any
 import pandas as pd
 import tomli_w
 
-from jaxbl.files import to_jsonable
+from jaxbl.files import to_jsonable, write_atomic
+from jaxbl.json_types import JsonObject
 from jaxbl.lines import DOUBT, doubts_among
-from jaxbl.quantity import Quantity
+from jaxbl.quantity import Quantity, read_quantities
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 _FIGURES = 4
@@ -23,15 +24,13 @@ def number_figures(numbers: Mapping[str, Quantity]) -> list[KeyFigure]:
     return [KeyFigure(str(numbers[path]), path) for path in first]
 
 
-def number_table(
-    heading: str, numbers: Mapping[str, Quantity], profiles: Mapping[str, Sequence[float] | None] = {}
-) -> ResultTable:
-    """Table of numbers by path, with intervals by profile likelihood, and without columns that would be empty."""
+def number_table(heading: str, entries: JsonObject) -> ResultTable:
+    """Table of a summary's numbers, with intervals by profile likelihood, and without columns that would be empty."""
     unknown = None, None
     rows = [
         [path, number.value, number.standard_error, *(number.interval or unknown), number.unit, number.nominal,
-         *(profiles.get(path) or unknown)]
-        for path, number in numbers.items()
+         *(entries[path].get("profile_interval") or unknown)]
+        for path, number in read_quantities(entries).items()
     ]  # fmt: skip
     columns = ["path", "value", "standard error", "95 % from", "to", "unit", "nominal", "by profile from", "to"]
     table = pd.DataFrame(rows, columns=columns).dropna(axis=1, how="all")
@@ -52,7 +51,7 @@ def write(result: Any, folder: Path, model: str = "") -> str:
     result.trace.to_parquet(folder / "trace.parquet", index=False)
     # that of a transmission alone is given
     model = model or format_model(result, folder / "trace.parquet")
-    (folder / "model.toml").write_text(model, encoding="utf-8")
+    write_atomic(folder / "model.toml", model)
     return model
 
 

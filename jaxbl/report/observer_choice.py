@@ -5,7 +5,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ import pandas as pd
 import tomli_w
 
 from jaxbl.config import Config
+from jaxbl.files import write_atomic
 from jaxbl.gains.observer_choice import TIME_CONSTANT, ObserverChoice, runs_are_equal
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines
 from jaxbl.result import KeyFigure, Result, ResultTable
 
 from .maps import axis_label, with_value
@@ -25,11 +25,13 @@ from .panels import SIDE_COLOURS, Axis, Figure, Line, Map, Panel, Scale, Span, a
 from .tune import error_label, for_title
 
 
-def draw(choice: ObserverChoice) -> list[Figure]:
+def draw(choice: ObserverChoice) -> Iterator[Figure]:
     """All figures of a choice: intervals for a single point, else a map for each side."""
-    summary = choice.summary
-    first, *more = summary["points"]
-    return [_map(choice.config, summary, side) for side in first["sides"]] if more else [_ratios(summary)]
+    first, *more = choice.summary["points"]
+    if more:
+        yield from (_map(choice.config, choice.summary, side) for side in first["sides"])
+    else:
+        yield _ratios(choice.summary)
 
 
 _RATIO = "ratio", "low", "high"
@@ -40,17 +42,19 @@ def _ratios(summary: JsonObject) -> Figure:
     panels = []
     for side, result in summary["points"][0]["sides"].items():
         kinds = result["kinds"]
-        compared, lost = pd.DataFrame(kinds, _RATIO).astype(float).dropna(axis=1), _lost_kinds(kinds)
-        ratio, low, high = compared.to_numpy()
-        texts = ["best" if i == 0 else _ratio(kinds[kind]) for i, kind in enumerate(compared)]
-        texts += ["diverged, or too slow"] * len(lost)
+        # the last ones have no ratio
+        ratios = pd.DataFrame(kinds, _RATIO).astype(float)
+        ratio, low, high = ratios.dropna(axis=1).to_numpy()
+        texts = [
+            "best" if kind == result["best"] else _ratio(numbers, "diverged, or too slow") for kind, numbers in kinds.items()
+        ]
         parts = [
             Span(1.0, 1.0, width=0.8, dashes="-"),
             *intervals(range(len(high)), low, ratio, high, colour=SIDE_COLOURS[side]),
-            Line([*high, *[0.9] * len(lost)], range(len(kinds)), width=0.0, marker=" ", texts=texts),
+            Line(ratios.loc["high"].fillna(0.9), range(len(kinds)), width=0.0, marker=" ", texts=texts),
         ]
         x = Axis("times the best one's error", log=True, ends=(0.9, 1.2 * (2.0 + max(high, default=1.0)) ** 1.5))
-        panels.append(Panel(x, name_rows([*compared, *lost]), parts, side))
+        panels.append(Panel(x, name_rows([*kinds]), parts, side))
     caption = (
         f"{error_label(summary)} of each kind over the best one's, {_where(summary)}: geometric mean over noise seeds, with "
         "its 95 % interval where they differ."
@@ -58,15 +62,10 @@ def _ratios(summary: JsonObject) -> Figure:
     return Figure("observers", panels, caption, len(panels), 5.2 * len(panels), 0.9 + 0.34 * len(summary["observers"]))
 
 
-def _lost_kinds(kinds: JsonObject) -> list[str]:
-    """Kinds without a ratio."""
-    return [kind for kind, result in kinds.items() if result["ratio"] is None]
-
-
-def _ratio(result: JsonObject) -> str:
-    """The ratio, with its interval if runs differ; more digits where it would read as one; a dash of none."""
+def _ratio(result: JsonObject, none: str = "–") -> str:
+    """The ratio, with its interval if runs differ; more digits where it would read as one; `none` where there is none."""
     if result["ratio"] is None:
-        return "–"
+        return none
     ratio, low, high = (f"{result[key]:.{3 if abs(result[key] - 1.0) > 0.005 else 6}g}" for key in _RATIO)
     return ratio if runs_are_equal(result) else f"{ratio} ({low} to {high})"
 
@@ -146,7 +145,7 @@ def _cell_text(point: JsonObject, short: dict[str, str]) -> str:
 def write(choice: ObserverChoice, folder: Path) -> None:
     """Write `gains.toml` of a single point."""
     if gains := observer_toml(choice.summary):
-        (folder / "gains.toml").write_text(gains, encoding="utf-8")
+        write_atomic(folder / "gains.toml", gains)
 
 
 def describe(choice: ObserverChoice) -> Result:
@@ -165,8 +164,8 @@ def describe(choice: ObserverChoice) -> Result:
         headline = "Which observer is best depends on the point; the map shows where."
         if len(points) == 1:
             verdict, headline = "doubtful", "No kind converges on both sides."
-    title, remarks = config.title or "Observers", choice_headline(summary)
-    return Result(title, verdict, headline, figures, remarks, summary["remarks"], _tables(config, summary))
+    title, remarks, tables = config.title or "Observers", [*choice_headline(summary)], [*_tables(config, summary)]
+    return Result(title, verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
 def observer_toml(summary: JsonObject) -> str | None:
@@ -181,7 +180,6 @@ def observer_toml(summary: JsonObject) -> str | None:
         f"# Objective: {summary['objective_metric']}, among {', '.join(summary['observers'])}.",
         *(f"# {side}: {result['ratio']:.3g} times the error of the best kind there." for side, result in sides.items()),
         '# To use it, put include = "gains.toml" at the top of a study and leave its own [observer] out.',
-        "",
     ]
     gains = {side: dict(result["gains"]) for side, result in sides.items()}
     constants = {side: gains[side].pop(TIME_CONSTANT) for side in sides if TIME_CONSTANT in gains[side]}
@@ -190,8 +188,8 @@ def observer_toml(summary: JsonObject) -> str | None:
         data["equivalent_control"] = {"time_constant": constants.get("motor")}
         if len(constants) > 1:
             times = ", ".join(f"{side}: {value:.3g} s" for side, value in constants.items())
-            lines[-1:] = [f"# A study has one equivalent_control.time_constant; the best of each side: {times}.", ""]
-    return "\n".join(lines) + tomli_w.dumps(data)
+            lines.append(f"# A study has one equivalent_control.time_constant; the best of each side: {times}.")
+    return "\n".join([*lines, tomli_w.dumps(data)])
 
 
 def _where(summary: JsonObject) -> str:
@@ -210,26 +208,27 @@ def _best_kinds(points: Sequence[JsonObject], side: str) -> list[tuple[str, str]
     return [(kind, f"best{where.format(count, len(points))}") for kind, count in counts.most_common()]
 
 
-def choice_headline(summary: JsonObject) -> Lines:
+def choice_headline(summary: JsonObject) -> Iterator[str]:
     """Which kind is best on each side, at how many points, and what fails; the table has by how much."""
-    lines, points = [], summary["points"]
+    points = summary["points"]
     for side in points[0]["sides"]:
         results = [point["sides"][side] for point in points]
         kinds = [f"{kind} is {share}" for kind, share in _best_kinds(points, side)]
         clauses = [f"{side}: {', '.join(kinds) or 'all kinds diverge, or are too slow'}"]
         further = {
             "not told apart from the best": [kind for result in results for kind in result["not_told_apart"]],
-            "diverge somewhere, or are too slow": [kind for result in results for kind in _lost_kinds(result["kinds"])],
+            "diverge somewhere, or are too slow": [
+                kind for result in results for kind, numbers in result["kinds"].items() if numbers["ratio"] is None
+            ],
         }
         if kinds:
             clauses += [f"{lead}: {', '.join(dict.fromkeys(names))}" for lead, names in further.items() if names]
-        lines.append(f"{'; '.join(clauses)}.")
-    return lines
+        yield f"{'; '.join(clauses)}."
 
 
-def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
+def _tables(config: Config, summary: JsonObject) -> Iterator[ResultTable]:
     """A table for each side: of a single point all kinds with their gains, else the ratios at each point."""
-    points, kinds, axes, tables = summary["points"], summary["observers"], summary["axes"], []
+    points, kinds, axes = summary["points"], summary["observers"], summary["axes"]
     for side, first in points[0]["sides"].items():
         if len(points) == 1:
             heading = side
@@ -248,5 +247,4 @@ def _tables(config: Config, summary: JsonObject) -> list[ResultTable]:
                 for point in points
                 for result in [point["sides"][side]]
             ]  # fmt: skip
-        tables.append(ResultTable(f"{heading}, {_where(summary)}", columns, rows))
-    return tables
+        yield ResultTable(f"{heading}, {_where(summary)}", columns, rows)

@@ -1,7 +1,7 @@
 """What `jaxbl simulate` leaves to be read. The figures are analogues of figures of the paper."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 from jaxbl.sweeps.trial import Trial
 
-from .gain_plane import conditions_line, draw_gain_plane
+from .gain_plane import describe_conditions, draw_gain_plane
 from .panels import SIDE_COLOURS, SIDES, TIME, VERMILION, ZERO, Array, Axis, Figure, Line, Panel
 
 
@@ -40,7 +40,7 @@ def describe(trial: Trial) -> Result:
             verdict = "doubtful"
             headline = f"{headline} By the exact condition, the gains of {who} do not ensure that at another start or input."
     quantities = [*itertools.product(sides, ("velocity", "torque"))]
-    if config.controller is not None:
+    if config.controller:
         quantities += [(config.controller.side, "following")]
     figures = []
     for side, quantity in quantities:
@@ -48,39 +48,41 @@ def describe(trial: Trial) -> Result:
         bound = f"; at any time at most {largest:.3g} is allowed" if quantity == "velocity" else ""
         text = "diverges" if error is None else f"{error:.3g} {SIDE_METRICS[f'{quantity}_rmse'].unit}"
         figures.append(KeyFigure(text, f"{side}: {quantity} error, rms{bound}"))
+    columns, tables = ["true", *sides], []
+    if identified := summary["identified"]:
+        rows = [[name, *map(values.get, columns)] for name, values in identified.items()]
+        tables.append(ResultTable("Identified", ["", *columns], rows))
     rows = [
         [name, *(metrics.get(f"{side}.{name}") for side in sides), metric.unit, metric.doc]
         for name, metric in SIDE_METRICS.items()
         if f"motor.{name}" in metrics
     ]
-    tables = [ResultTable("Metrics", ["", *sides, "unit", "meaning"], rows)]
-    if identified := summary["identified"]:
-        rows = [[name, values["true"], *(values[side] for side in sides)] for name, values in identified.items()]
-        tables.insert(0, ResultTable("Identified", ["", "true", *sides], rows))
-    remarks = [conditions_line(side, gains, "the true bound along this run") for side, gains in judged.items()]
+    tables.append(ResultTable("Metrics", ["", *sides, "unit", "meaning"], rows))
+    remarks = [*describe_conditions(judged, "the true bound along this run")]
     return Result(config.title or "Run", verdict, headline, figures, remarks, summary["remarks"], tables)
 
 
-def draw(trial: Trial) -> list[Figure]:
+def draw(trial: Trial) -> Iterator[Figure]:
     """All figures of a run."""
-    trace, controller = trial.trace, trial.config.controller
-    is_geared = trial.config.is_geared
+    trace, is_geared = trial.trace, trial.config.is_geared
     name, seen_from = ("transmitted torque C", SIDES) if is_geared else ("disturbance torque", ("motor",))
     estimates = {f"from the {side} observer": (f"{side}.torque_estimate", SIDE_COLOURS[side]) for side in seen_from}
     caption = f"The {name}, true and by the equivalent controls (17) (analogue of Fig. 16)."
-    figures = [_compare("torque", trace, name, "N m", "true", "torque", estimates, caption)]
+    yield _compare("torque", trace, name, "N m", "true", "torque", estimates, caption)
     for side in trial.config.sides:
         name, observed = f"{side}.velocity", {"observer": (f"{side}.velocity_estimate", VERMILION)}
         caption = f"{side.capitalize()} velocity, true and observed, and the error."
-        figures.append(_compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", "true", name, observed, caption))
-    if controller is not None:
+        yield _compare(f"{side}_velocity", trace, f"{side} velocity", "rad/s", "true", name, observed, caption)
+    if controller := trial.config.controller:
         name, moved = f"{controller.side} position", {"true": (f"{controller.side}.position", VERMILION)}
         caption = f"{controller.side.capitalize()} position, the reference that it is to follow, and the error."
-        figures.append(_compare("following", trace, name, "rad", "reference", "reference", moved, caption))
-    judged = trial.summary["conditions"]
-    figures += [draw_gain_plane(side, gains) for side, gains in judged.items() if gains["f_plus"] > 0.0]
-    figures += itertools.chain(*(error_plane(trace, side, gains) for side, gains in judged.items()))
-    return [*figures, _hysteresis(trace)] if is_geared else figures
+        yield _compare("following", trace, name, "rad", "reference", "reference", moved, caption)
+    judged = trial.summary["conditions"].items()
+    yield from (draw_gain_plane(side, gains) for side, gains in judged if gains["f_plus"] > 0.0)
+    for side, gains in judged:
+        yield from error_plane(trace, side, gains)
+    if is_geared:
+        yield _hysteresis(trace)
 
 
 def _compare(
@@ -174,7 +176,7 @@ def _reach(error: Array, majorant: Array) -> float:
     return 1.1 * (largest if largest < 4.0 * reach else 1.2 * reach)
 
 
-def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]:
+def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> Iterator[Figure]:
     """The error of an observer in its phase plane beside the majorant of the proof; no figure where no two
     peaks stand out from the chatter.
 
@@ -186,7 +188,7 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
     error, slope, peaks, ratio, curve, reaches = error_path(trace, side, judged)
     lambda_, alpha, bound = (judged[name] for name in ("lambda", "alpha", "f_plus"))
     if len(peaks) < 2:
-        return []
+        return
     worst = f", at most {judged['peak_ratio']:.3g}" if judged["peak_ratio"] else ""
     name = f"error: ratio of peaks {np.median(np.abs(peaks[1:] / peaks[:-1])):.3g} (median){worst}"
     parts = [Line(error, slope, name, VERMILION, 1.2)]
@@ -195,12 +197,10 @@ def error_plane(trace: DataFrame, side: str, judged: JsonObject) -> list[Figure]
     x_ends, y_ends = ((-reach, reach) if reach else None for reach in reaches)
     axes = Axis("position error e (rad)", ends=x_ends), Axis("its slope ė (rad/s)", ends=y_ends)
     reason = "" if ratio is not None else f" There is no majorant: {'λ is zero' if alpha > bound else 'α is not above f⁺'}."
-    return [
-        Figure(
-            f"error_plane_{side}",
-            [Panel(*axes, parts)],
-            f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane (cf. "
-            f"Fig. 29). The majorant of the proof is for the worst disturbance within f⁺ = {bound:.3g} rad/s², without "
-            f"friction; a ratio below 1 proves convergence.{reason}",
-        )
-    ]
+    yield Figure(
+        f"error_plane_{side}",
+        [Panel(*axes, parts)],
+        f"Error of the {side} observer (λ = {lambda_:.3g} √rad/s, α = {alpha:.3g} rad/s²) in the phase plane (cf. "
+        f"Fig. 29). The majorant of the proof is for the worst disturbance within f⁺ = {bound:.3g} rad/s², without "
+        f"friction; a ratio below 1 proves convergence.{reason}",
+    )

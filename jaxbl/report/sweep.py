@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def describe(result: StudyResult) -> Result:
 def answer_sweep(result: StudyResult) -> Result:
     """Say where the observers work, and which gains are best, with tables of axes that matter."""
     config, survey, remarks = result.config, _Survey(result), []
-    finished, figures = result.is_finished(survey.runs), []
+    finished, figures, reserves = result.is_finished(survey.runs), [], {}
     if not finished:
         remarks.append(
             f"The study is not finished: {survey.runs} runs so far, white where none is. Go on with 'jaxbl sweep'."
@@ -62,7 +63,7 @@ def answer_sweep(result: StudyResult) -> Result:
             f"{side}: the best {gain} is the {way.replace('er', 'est')} of its axis; a wider axis may have better ones."
             for gain, way in best.ends.items()
         ]
-        row = runs.reset_index().iloc[best.index]
+        row, reserves[side] = runs.reset_index().iloc[best.index], best.margin
         place = ", ".join(f"{name.rpartition('.')[2]} = {row[name]:.3g}" for name in runs.index.names)
         figures += [
             KeyFigure(f"{row['error']:.3g} rad/s", f"{side}: worst velocity error, rms, of the best gains ({place})"),
@@ -74,10 +75,8 @@ def answer_sweep(result: StudyResult) -> Result:
         ]
     # where gains are not varied, runs that fail are not what was sought
     partly = any(count < survey.even for side, count in survey.converged.items() if side not in survey.best)
-    reserves = {side: best.margin for side, (best, _) in survey.best.items() if best is not None}
-    partly |= len(reserves) < len(survey.best)
     thin = say_thin_reserve(reserves)
-    verdict = "doubtful" if not finished or partly or thin else "good"
+    verdict = "doubtful" if not finished or partly or len(reserves) < len(survey.best) or thin else "good"
     if finished and not (survey.diverged < survey.runs and all(survey.converged.values())):
         verdict = "failed"
     elif verdict == "good" and not survey.converged:
@@ -94,8 +93,8 @@ def answer_sweep(result: StudyResult) -> Result:
         rows = [[axis.path, _share(axis.alone), _share(axis.total)] for axis in ranked]
         tables.append(ResultTable(heading, ["axis", "by itself", "with others"], rows))
     # the headline has the first
-    figures += survey.list_ranges()[1:]
-    headline = " ".join(filter(None, (_headline(result, survey), thin)))
+    figures += [*survey.list_ranges()][1:]
+    headline = f"{_headline(result, survey, reserves)} {thin}".rstrip()
     return Result(config.title or "Study", verdict, headline, figures, remarks, config.notes, tables)
 
 
@@ -111,6 +110,7 @@ class _Survey:
     """The numbers behind the sentences and the table of axes, found in one reading.
 
     Attributes:
+        config: of the study.
         runs: their number; `even` those on points that are always simulated; `diverged`.
         converged: how many of the even ones converged, by side; none where the study does not say.
         by_value: the even runs and those that converged at each value of an axis of a grid, by side and path.
@@ -121,7 +121,7 @@ class _Survey:
     """
 
     def __init__(self, result: StudyResult):
-        config = result.config
+        config = self.config = result.config
         paths = config.axis_paths
         metrics = [name for name in result.columns if name.rpartition(".")[2] in ("converged", "velocity_rmse", *MARGINS)]
         # a refined study has most of its runs at the boundary: a share of all runs would depend on the refinement
@@ -157,9 +157,9 @@ class _Survey:
                 runs = worst_runs(Groups(Rows(result, columns), gains, paths), error)
                 self.best[side] = best_gains(runs), runs
 
-    def find_edge(self, side: str) -> tuple[str, float, float, float] | None:
-        """The axis, and the value up to which and beyond which a side converges in the most different shares of runs, with
-        both shares; None where no axis parts them by `_PARTED`."""
+    def describe_edge(self, side: str) -> str:
+        """Say up to which value of an axis, and beyond it, a side converges in the most different shares of runs; "" where
+        no axis parts them by `_PARTED`."""
         edges = []
         for (judged, path), counts in self.by_value.items():
             if judged == side and is_numeric_dtype(counts.index):
@@ -167,21 +167,23 @@ class _Survey:
                 above = counts.sum() - below
                 shares = zip(below.index, below["sum"] / below["size"], above["sum"] / above["size"], strict=True)
                 edges += [(path, *split) for split in shares if abs(split[1] - split[2]) >= _PARTED]
-        return max(edges, key=lambda edge: abs(edge[2] - edge[3]), default=None)
+        if not edges:
+            return ""
+        path, value, first, second = max(edges, key=lambda edge: abs(edge[2] - edge[3]))
+        place = with_value(self.config, path, float(f"{value:.3g}"))
+        return f" ({percent(first)} up to {place}, {percent(second)} beyond)"
 
-    def list_ranges(self) -> list[KeyFigure]:
+    def list_ranges(self) -> Iterator[KeyFigure]:
         """From where to where metrics go, and in how many runs they are 0."""
-        figures = []
         for column, (low, high, zeros) in self.ranges.items():
             # of a metric that no run has, nothing
             if low <= high:
                 none = f" (0 in {percent(zeros / self.runs)} of the runs)" if zeros else ""
-                figures.append(KeyFigure(f"{low:.3g} to {high:.3g} {find_metric(column).unit}{none}", value_words(column)))
-        return figures
+                yield KeyFigure(f"{low:.3g} to {high:.3g} {find_metric(column).unit}{none}", value_words(column))
 
 
-def _headline(result: StudyResult, survey: _Survey) -> str:
-    """Say in how many runs the observers converge."""
+def _headline(result: StudyResult, survey: _Survey, with_best: Iterable[str]) -> str:
+    """Say in how many runs the observers converge; `with_best` are the sides that have best gains."""
     runs, among = f"{survey.runs} runs", ""
     if result.config.sweep.refine is not None:
         points = len(Points(result.config))
@@ -189,27 +191,24 @@ def _headline(result: StudyResult, survey: _Survey) -> str:
         runs = f"{runs} at {simulated} of {points} grid points ({percent(simulated / points)})"
         among = " on the coarse grid"
     even = survey.even or math.nan
-    works = {side: ", with the best gains in every run" for side, (best, _) in survey.best.items() if best is not None}
+    works = dict.fromkeys(with_best, ", with the best gains in every run")
     for side in survey.converged.keys() - survey.best.keys():
-        if edge := survey.find_edge(side):
-            path, value, below, above = edge
-            place = with_value(result.config, path, float(f"{value:.3g}"))
-            works[side] = f" ({percent(below)} up to {place}, {percent(above)} beyond)"
+        works[side] = survey.describe_edge(side)
     shares = [
         f"the {side} observer converges in {100 * count / even:.1f} %{among}{works.get(side, '')}"
         for side, count in survey.converged.items()
     ]
     if shares:
         return f"{runs}: {'; '.join(shares)}."
-    extents = [f"{metric} goes from {ends}" for ends, metric in survey.list_ranges()] or ["no figure has a number"]
-    return f"The study does not ask what converges. In {runs}, {extents[0]}."
+    extents = (f"{metric} goes from {ends}" for ends, metric in survey.list_ranges())
+    return f"The study does not ask what converges. In {runs}, {next(extents, 'no figure has a number')}."
 
 
 def _law_table(laws: list[Law]) -> ResultTable:
     rows = []
     for law in laws:
         texts = "no law", "–", "–"
-        if law.fit is not None and law.range is not None:
+        if law.fit and law.range:
             halves = f"{law.fit.half_slopes[0]:.2f}, {law.fit.half_slopes[1]:.2f}"
             texts = slope_text(law.fit), halves, f"{law.range[0]:g} to {law.range[1]:g} ({law.in_range.sum()})"
         slope, halves, ends = (text.replace(" ", "\u00a0") for text in texts)

@@ -1,17 +1,18 @@
 """What `jaxbl tune` leaves to be read: the objective over the gains, what limits them, comparisons, certificates."""
 
+from collections.abc import Iterator
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 
-from jaxbl.files import write_json
+from jaxbl.files import write_atomic, write_json
 from jaxbl.gains.best_gains import NEARLY_AS_GOOD
 from jaxbl.gains.tune import Tuning
 from jaxbl.gains.tune_summary import describe_gains
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines, doubts_among, percent
+from jaxbl.lines import doubts_among, percent
 from jaxbl.result import KeyFigure, Result, ResultTable
 from jaxbl.sweeps.metrics import SIDE_METRICS
 
@@ -19,7 +20,7 @@ from .gain_plane import (
     EXACT,
     RESERVE_WORDS,
     condition_curves,
-    conditions_line,
+    describe_conditions,
     gain_axes,
     say_thin_reserve,
     usual_rule_curve,
@@ -47,8 +48,8 @@ def _map(tuning: Tuning, side: str) -> Figure:
     runs = tuning.candidates[side].query("stage == 0").pivot(index="lambda", columns="alpha")
     error = runs["error"]
     longest = np.inf if (table := tuning.config.tune) is None else table.longest_convergence or np.inf
-    works = runs["converged"] & (runs["convergence_time"] <= longest)
-    grid, failed = error.to_numpy(float), ~works.to_numpy(bool)
+    # gains that do not converge have no time
+    grid, failed = error.to_numpy(float), ~(runs["convergence_time"].to_numpy(float) <= longest)
     values = np.where(failed, np.nan, grid)
     x, y = (cell_edges(axis.to_numpy(float), True) for axis in (error.columns, error.index))
     alphas, lambdas = ((edges[0], edges[-1]) for edges in (x, y))
@@ -105,7 +106,7 @@ def write(tuning: Tuning, folder: Path) -> None:
     if proven := _proven(summary):
         data = {"title": summary["title"], "observer": "super_twisting", "assumptions": ASSUMPTIONS, "sides": proven}
         write_json(folder / "certificate.json", data)
-    (folder / "gains.toml").write_text(gains_toml(summary), encoding="utf-8")
+    write_atomic(folder / "gains.toml", gains_toml(summary))
 
 
 def describe(tuning: Tuning) -> Result:
@@ -121,28 +122,20 @@ def describe(tuning: Tuning) -> Result:
         headline = f"The gains hardly matter here; take {chosen}."
     elif "range" in matter:
         verdict, headline = "doubtful", f"Better gains may lie beyond the range searched; of those in it take {chosen}."
-    certified = certificate_lines(summary)
+    doubts, reasons, certified = doubts_among(summary["remarks"]), [*_reasons(summary)], [*certificate_lines(summary)]
+    remarks = [*doubts, *reasons, *certified]
     if thin := say_thin_reserve({side: entry["margin"] for side, entry in summary["verdict"].items()}):
         verdict, headline = "doubtful", f"{headline} {thin}"
     if beaten := _better_gains(summary):
         verdict, headline = "doubtful", f"{beaten[0]} err less on the held-out runs than the gains that the search found."
-    doubts = doubts_among(summary["remarks"])
-    remarks = [*doubts, *_reasons(summary), *certified]
     if any(proof.get("search", {}).get("violations") for proof in summary.get("certificates", {}).values()):
         # before all else
         verdict, headline = "failed", "The search found an error above what was proven."
-        remarks = [*certified, *doubts, *_reasons(summary)]
-    details, holdout = [line for line in summary["remarks"] if line not in doubts], summary["holdout"]
-    held_out = f"the held-out excitation ({holdout['excitation']['kind']})"
-    where = "the study's excitation with other noise" if holdout["same_excitation"] else held_out
-    tables = [
-        _gains_table(summary),
-        *certificate_tables(summary),
-        _comparison_table(f"On {where}, worst and median of all runs", holdout["rows"]),
-    ]
-    return lead_with_doubt(
-        Result(tuning.config.title or "Gains", verdict, headline, _key_figures(summary), remarks, details, tables)
-    )
+        remarks = [*certified, *doubts, *reasons]
+    details = [line for line in summary["remarks"] if line not in doubts]
+    tables = [_gains_table(summary), *certificate_tables(summary), _comparison_table(summary["holdout"])]
+    title, figures = tuning.config.title or "Gains", [*_key_figures(summary)]
+    return lead_with_doubt(Result(title, verdict, headline, figures, remarks, details, tables))
 
 
 def _better_gains(summary: JsonObject) -> list[str]:
@@ -151,15 +144,14 @@ def _better_gains(summary: JsonObject) -> list[str]:
     return [
         f"{row['side']}: {describe_gains(row['name'])}"
         for row in summary["holdout"]["rows"]
-        if (factor := factors[row["side"]].get(row["name"], {}).get(metric)) is not None
-        and (factor["worst"] or 1.0) < 1.0 / (1.0 + NEARLY_AS_GOOD)
+        if (factors[row["side"]].get(row["name"], {}).get(metric, {}).get("worst") or 1.0) < 1.0 / (1.0 + NEARLY_AS_GOOD)
         and all((row[f"margin_{key}"] or 0.0) >= margin for key, margin in summary["margins"].items())
     ]
 
 
-def _key_figures(summary: JsonObject) -> list[KeyFigure]:
+def _key_figures(summary: JsonObject) -> Iterator[KeyFigure]:
     """The error of each side's gains beside that of the others, and how far the gains may change."""
-    metric, figures = f"{summary['objective']}_rmse", []
+    metric = f"{summary['objective']}_rmse"
     for side, verdict in summary["verdict"].items():
         worst, factors = summary["achieved"][side][metric], summary["holdout"]["factors"][side]
         texts = (
@@ -167,14 +159,9 @@ def _key_figures(summary: JsonObject) -> list[KeyFigure]:
             for name, factor in factors.items()
             if "why_none" not in factor and factor[metric]["worst"] is not None
         )
-        figures += [
-            KeyFigure(
-                f"{worst:.3g} {SIDE_METRICS[metric].unit}",
-                f"{side}: worst {summary['objective']} error, rms{next(texts, '')}",
-            ),
-            KeyFigure(f"× {verdict['margin']:.3g}", f"{side}: {RESERVE_WORDS}"),
-        ]
-    return figures
+        size = f"{worst:.3g} {SIDE_METRICS[metric].unit}"
+        yield KeyFigure(size, f"{side}: worst {summary['objective']} error, rms{next(texts, '')}")
+        yield KeyFigure(f"× {verdict['margin']:.3g}", f"{side}: {RESERVE_WORDS}")
 
 
 def gains_toml(summary: JsonObject) -> str:
@@ -210,16 +197,17 @@ def for_title(summary: JsonObject) -> str:
     return f" for: {title}" if title else ""
 
 
-def _reasons(summary: JsonObject) -> Lines:
+def _reasons(summary: JsonObject) -> Iterator[str]:
     """Say whether gains matter, what binds, and how far the gains are from where the exact condition fails."""
-    lines = [f"{side}: {describe_verdict(verdict)}" for side, verdict in summary["verdict"].items()]
+    for side, verdict in summary["verdict"].items():
+        yield f"{side}: {describe_verdict(verdict)}"
     for side, limits in summary["limits"].items():
         if binding := [name for name, constraint in limits["constraints"].items() if constraint["binds"]]:
-            lines.append(f"{side}: a smaller error is forbidden by {' and '.join(binding)}.")
+            yield f"{side}: a smaller error is forbidden by {' and '.join(binding)}."
         elif limits["range_ends"]:
             keys = " and ".join(f"tune.{end.split()[1]}_ratio" for end in limits["range_ends"])
-            lines.append(f"{side}: the error still falls, or stays level, where the searched range ends; widen {keys}.")
-    return lines + [conditions_line(side, gains, "the largest of all runs") for side, gains in summary["conditions"].items()]
+            yield f"{side}: the error still falls, or stays level, where the searched range ends; widen {keys}."
+    yield from describe_conditions(summary["conditions"])
 
 
 def describe_verdict(verdict: JsonObject) -> str:
@@ -251,16 +239,19 @@ def _gains_table(summary: JsonObject) -> ResultTable:
     return ResultTable("Gains", ["gain", "value", "over f⁺, λ over √f⁺", "a smaller one", "a larger one"], rows)
 
 
-def _comparison_table(heading: str, gains: list[JsonObject]) -> ResultTable:
+def _comparison_table(holdout: JsonObject) -> ResultTable:
+    """The gains that were compared on the held-out runs, those of the motor first."""
+    held_out = f"the held-out excitation ({holdout['excitation']['kind']})"
+    where = "the study's excitation with other noise" if holdout["same_excitation"] else held_out
     rows = [
         [*(row[key] for key in ("side", "name", "lambda", "alpha")), 100.0 * row["converged"],
          *(row[name][how] for name in ("velocity_rmse", "torque_rmse") for how in ("worst", "median")),
          row["convergence_time"]["worst"], *(row[key] for key in _MARGINS.values())]
-        for row in sorted(gains, key=lambda row: row["side"] != "motor")
+        for row in sorted(holdout["rows"], key=lambda row: row["side"] != "motor")
     ]  # fmt: skip
     columns = ["side", "gains", "λ", "α", "converged (%)", "velocity error (rad/s)", "median", "torque error (N m)",
                "median", "convergence (s)", *_MARGINS]  # fmt: skip
-    return ResultTable(heading, columns, rows)
+    return ResultTable(f"On {where}, worst and median of all runs", columns, rows)
 
 
 ASSUMPTIONS = (
@@ -280,47 +271,44 @@ def _proven(summary: JsonObject) -> JsonObject:
     return {side: proof for side, proof in summary.get("certificates", {}).items() if proof["certified"]}
 
 
-def certificate_lines(summary: JsonObject) -> Lines:
-    """The certificates in sentences."""
-    certificates = summary.get("certificates", {}).items()
-    return [line for side, proof in certificates for line in _certificate_lines(side, proof, summary["passed_over"][side])]
-
-
 def _above(value: float, rounding: str = ROUND_CEILING) -> float:
     """Rounded up to four digits (to rounding errors): what is printed as proven must not say more than the proof."""
     return float(Context(4, rounding).create_decimal(f"{value:.12g}"))
 
 
-def _certificate_lines(side: str, proof: JsonObject, passed_over: int) -> Lines:
-    """Say what is promised of a side, what was tried, and whether that is what was asked for."""
-    if not proof["certified"]:
-        return [f"{side}: no certificate: {proof['why_none']}."]
-    # what is assumed is rounded down
-    bounds = {name: _above(value, ROUND_FLOOR) for name, value in proof["assumptions"].items() if name != "discretisation"}
-    search = proof["search"]
-    nominal = f", nominal acceleration of {bounds['acceleration']:.4g} rad/s²" if "acceleration" in bounds else ""
-    promise = f"{_above(proof['accuracy']):.4g} rad/s"
-    period = f"{proof['assumptions']['period']:.4g} s"
-    lines = [
-        f"{side}, promised: a velocity error of at most {promise} from {_above(proof['reaching_time']):.4g} s on, proven "
-        f"(with {_above(proof['final_accuracy']):.4g} rad/s from {_above(proof['curve']['time'][-1]):.4g} s on) for any "
-        f"noise within ±{bounds['noise']:.4g} rad and any missing acceleration within ±{bounds['f_plus']:.4g} rad/s²"
-        f"{nominal}, sampled every {period}, from errors of {bounds['velocity_error']:.4g} rad/s "
-        f"and {bounds['position_error']:.4g} rad.",
-        f"{side}, tried: the worst of {search['runs']} adversarial runs errs by {search['worst']:.3g} rad/s. Another search "
-        f"may find more, but not more than the {promise} that are promised.",
-    ]
-    missed = [
-        f"{name.replace('_', ' ')} {limit['asked']:.3g} {'s' if name == 'reaching_time' else 'rad/s'}"
-        for name, limit in proof["limits"].items()
-        if not limit["met"]
-    ]
-    if missed:
-        lines.insert(0, f"{side}, certificate: what was asked for is not proven: {', '.join(missed)}.")
-    elif proof["limits"]:
-        gains = f"; {passed_over} gains with less error in the runs do not" if passed_over else ""
-        lines.append(f"{side}, certificate: the gains keep what was asked for{gains}.")
-    return lines
+def certificate_lines(summary: JsonObject) -> Iterator[str]:
+    """Say what the certificates promise of each side, what was tried, and whether that is what was asked for."""
+    for side, proof in summary.get("certificates", {}).items():
+        if not proof["certified"]:
+            yield f"{side}: no certificate: {proof['why_none']}."
+            continue
+        missed = [
+            f"{name.replace('_', ' ')} {limit['asked']:.3g} {'s' if name == 'reaching_time' else 'rad/s'}"
+            for name, limit in proof["limits"].items()
+            if not limit["met"]
+        ]
+        if missed:
+            yield f"{side}, certificate: what was asked for is not proven: {', '.join(missed)}."
+        search, assumed = proof["search"], proof["assumptions"]
+        # what is assumed is rounded down
+        bounds = {name: _above(value, ROUND_FLOOR) for name, value in assumed.items() if name != "discretisation"}
+        nominal = f", nominal acceleration of {bounds['acceleration']:.4g} rad/s²" if "acceleration" in bounds else ""
+        promise = f"{_above(proof['accuracy']):.4g} rad/s"
+        yield (
+            f"{side}, promised: a velocity error of at most {promise} from {_above(proof['reaching_time']):.4g} s on, "
+            f"proven (with {_above(proof['final_accuracy']):.4g} rad/s from {_above(proof['curve']['time'][-1]):.4g} s on) "
+            f"for any noise within ±{bounds['noise']:.4g} rad and any missing acceleration within "
+            f"±{bounds['f_plus']:.4g} rad/s²{nominal}, sampled every {assumed['period']:.4g} s, from errors of "
+            f"{bounds['velocity_error']:.4g} rad/s and {bounds['position_error']:.4g} rad."
+        )
+        yield (
+            f"{side}, tried: the worst of {search['runs']} adversarial runs errs by {search['worst']:.3g} rad/s. Another "
+            f"search may find more, but not more than the {promise} that are promised."
+        )
+        if proof["limits"] and not missed:
+            passed_over = summary["passed_over"][side]
+            gains = f"; {passed_over} gains with less error in the runs do not" if passed_over else ""
+            yield f"{side}, certificate: the gains keep what was asked for{gains}."
 
 
 def certificate_tables(summary: JsonObject) -> list[ResultTable]:

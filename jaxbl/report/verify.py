@@ -5,6 +5,7 @@
 # pyright: reportReturnType=false
 
 import itertools
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,10 @@ import numpy as np
 from jaxbl.gains.error_system import list_conditions
 from jaxbl.gains.verify import Verdict, sides_with_gain_axes
 from jaxbl.json_types import JsonObject
-from jaxbl.lines import Lines
 from jaxbl.observer.conditions import judge_gains
 from jaxbl.result import KeyFigure, Result, ResultTable
 
-from .gain_plane import condition_curves, conditions_line
+from .gain_plane import condition_curves, describe_conditions
 from .loop_gains import margin_table
 from .maps import cell_edges
 from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mark
@@ -24,7 +24,7 @@ from .panels import MARKERS, Axis, Figure, Line, Map, Panel, Scale, literal, mar
 _LEVELS = {"drive": "drive: ideal encoders, implicit observer", "sampled": "sampled: as the study has it"}
 
 
-def draw(verdict: Verdict) -> list[Figure]:
+def draw(verdict: Verdict) -> Iterator[Figure]:
     """The atlas with the study's own gains, the usual pair and the study's marks; the runs of the drive are for
     `jaxbl explore`."""
     plane = verdict.error_map
@@ -53,7 +53,7 @@ def draw(verdict: Verdict) -> list[Figure]:
         "curve. White is ρ = 1, where the exact condition and the simulated boundary (found by bisection) lie."
     )
     axes = (Axis(label, log=True, ends=(values[0], values[-1])) for label, values in ranges.items())
-    return [Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)]
+    yield Figure("atlas", [Panel(*axes, parts, title)], caption, height=5.2)
 
 
 def write(verdict: Verdict, folder: Path) -> None:
@@ -91,13 +91,10 @@ def describe(verdict: Verdict) -> Result:
         for margin, name in margins[:4]
         if margin
     ]
-    tables = [_level_table(level) for level in levels]
-    if marks:
-        tables.insert(0, _mark_table(marks))
+    tables = [*[_mark_table(marks)] * bool(marks), *map(_level_table, levels)]
     if margins := verdict.summary["loop_margins"]:
         tables.append(margin_table(margins))
-    remarks = [conditions_line(side, judged, "the largest of all runs") for side, judged in own_gains.items()]
-    remarks += _level_lines(verdict)
+    remarks = [*describe_conditions(own_gains), *_level_lines(verdict)]
     return Result(verdict.config.title or "Gain conditions", word, headline, figures, remarks, verdict.config.notes, tables)
 
 
@@ -111,9 +108,8 @@ def _judge_own_gains(verdict: Verdict) -> JsonObject:
     return judged
 
 
-def _level_lines(verdict: Verdict) -> Lines:
+def _level_lines(verdict: Verdict) -> Iterator[str]:
     """Say where the observer failed although a condition held, and why."""
-    lines = []
     for level in verdict.summary["levels"]:
         counts = ", ".join(
             f"{entry['title']} {entry['counterexamples']} of {entry['holds']}"
@@ -124,8 +120,7 @@ def _level_lines(verdict: Verdict) -> Lines:
             causes = list(level["causes"].get("true", {}).items())[:4]
             text = ", ".join(f"{cause} ({count})" for cause, count in causes)
             name = ", ".join(level[key] for key in ("level", "side") if level.get(key))
-            lines.append(f"{name}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}.")
-    return lines
+            yield f"{name}: the observer failed although a condition held: {counts}. Causes, by experiment: {text}."
 
 
 def _level_table(level: JsonObject) -> ResultTable:

@@ -1,10 +1,9 @@
 """What `jaxbl watch` leaves: values over time as CSV, a summary, one figure, and a page."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pandas as pd
-import tomli_w
 
 from jaxbl.files import catch_write_errors
 from jaxbl.json_types import JsonObject
@@ -25,7 +24,7 @@ LABELS = {
 def write(watch: Watch, folder: Path) -> str:
     """Write `watch.csv`. Returns the study's TOML."""
     watch.values.to_csv(folder / VALUES, index=False)
-    return tomli_w.dumps(watch.task.config.to_dict())
+    return watch.task.config.to_toml()
 
 
 def describe(watch: Watch) -> Result:
@@ -34,7 +33,7 @@ def describe(watch: Watch) -> Result:
     last, limit, alarm = (summary[key] for key in ("last", "alarm_gap", "alarm"))
     units, count = summary["units"]["motor"], summary["values"]
     verdict, headline = "good", f"Watched: the numbers were determined at {summary['determined']} of {count} times."
-    if alarm is not None:
+    if alarm:
         verdict = "failed"
         headline = (
             f"ALARM from {alarm['t']:.1f} s on: the half gap is beyond {limit:g} {units['half_gap']}, "
@@ -61,7 +60,7 @@ def describe(watch: Watch) -> Result:
             f"{LABELS[name]} at {end['t']:.1f} s (95 %: {end[f'{name}_from']:.4g} to {end[f'{name}_to']:.4g})",
         )
         for name in ("half_gap", "stiffness")
-        if last is not None and name in last
+        if last and name in last
         for end in (summary["first"], last)
     ]
     remarks = doubts_among(summary["notes"])
@@ -92,10 +91,10 @@ def open_values(folder: Path, task: WatchTask) -> Callable[[JsonObject], None]:
     return add
 
 
-def draw(watch: Watch) -> list[Figure]:
+def draw(watch: Watch) -> Iterator[Figure]:
     """Gap, stiffness and friction over time."""
     if not len(watch.values):
-        return []
+        return
     task = watch.task
     caption = f"Numbers of the {task.window:g} s before each time by both observers, with 95 % intervals."
     if task.alarm_gap is not None:
@@ -103,8 +102,9 @@ def draw(watch: Watch) -> list[Figure]:
     # gap and stiffness are seen at once; friction, below, acts on a shaft of its own on each side
     law = [_panel(watch, name, *SIDES) for name in ("half_gap", "stiffness") if f"motor.{name}" in watch.values]
     friction = [_panel(watch, name, side) for name in ("coulomb", "viscous") for side in SIDES]
-    figures = ("watch", law), ("watch_friction", friction)
-    return [Figure(name, panels, caption, height=1.5) for name, panels in figures if panels]
+    if law:
+        yield Figure("watch", law, caption, height=1.5)
+    yield Figure("watch_friction", friction, caption, height=1.5)
 
 
 def _panel(watch: Watch, name: str, *sides: str) -> Panel:

@@ -129,7 +129,7 @@ def test_what_is_printed_is_proven(certified_gains, change):
     }
     certificate_data["assumptions"] = certified_gains["assumptions"] | arguments
     summary = {"certificates": {"motor": certificate_data}, "passed_over": {"motor": 0}}
-    line = certificate_lines(summary)[0]
+    line = next(certificate_lines(summary))
     accuracy, time, final, end, noise, f_plus, period, velocity, position = map(
         float, re.findall(r"[\d.]+(?:e-\d+)?(?= |\.$)", line)
     )
@@ -254,7 +254,7 @@ def test_gains_are_chosen_that_keep_the_limits(tuned_study):
         f_plus = max(limited.summary["f_plus"]["motor"], row["f_plus"])
         bounds = certificate_data["assumptions"] | {"f_plus": f_plus, "runs": 1}
         assert certify(row["lambda"], row["alpha"], **bounds)["final_accuracy"] > limit
-    lines = certificate_lines(limited.summary)
+    lines = [*certificate_lines(limited.summary)]
     assert any(
         f"the gains keep what was asked for; {len(better_candidates)} gains with less error" in line for line in lines
     )
@@ -264,7 +264,7 @@ def test_limits_that_no_gains_keep_are_said_to_be_missed(tuned_study):
     tuned = tune(study(accuracy=1e-6))
     assert tuned.summary["gains"] == tuned_study.summary["gains"]
     assert tuned.summary["passed_over"] == {"motor": 0}
-    lines = certificate_lines(tuned.summary)
+    lines = [*certificate_lines(tuned.summary)]
     assert "motor, certificate: what was asked for is not proven: accuracy 1e-06 rad/s." in lines
 
 

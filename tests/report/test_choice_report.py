@@ -63,7 +63,7 @@ def test_report_holds_lines_numbers_and_figures(report_folder):
 
 def test_the_table_has_the_numbers_of_the_summary(point_choice):
     motor = point_choice.summary["points"][0]["sides"]["motor"]
-    assert choice_headline(point_choice.summary)[0].startswith(f"motor: {motor['best']} is best")
+    assert next(choice_headline(point_choice.summary)).startswith(f"motor: {motor['best']} is best")
     result = describe(point_choice)
     rows = {row[0]: row for row in result.tables[0].rows}
     for kind, errors in motor["kinds"].items():
@@ -76,11 +76,11 @@ def test_kinds_that_are_alike_are_said_first(point_choice):
     side = summary["points"][0]["sides"]["motor"]
     best, second = list(side["kinds"])[:2]
     side["not_told_apart"] = [second]
-    assert choice_headline(summary)[0].startswith(f"motor: {best} is best; not told apart from the best: {second}")
+    assert next(choice_headline(summary)).startswith(f"motor: {best} is best; not told apart from the best: {second}")
     side["kinds"][second]["ratio"] = None
-    assert choice_headline(summary)[0].endswith(f"; diverge somewhere, or are too slow: {second}.")
+    assert next(choice_headline(summary)).endswith(f"; diverge somewhere, or are too slow: {second}.")
     side["best"] = None
-    assert choice_headline(summary)[0] == "motor: all kinds diverge, or are too slow."
+    assert next(choice_headline(summary)) == "motor: all kinds diverge, or are too slow."
 
 
 def test_the_point_figure_has_a_dot_at_each_ratio(point_choice):
@@ -112,12 +112,12 @@ def test_the_map_names_the_best_kind_in_each_cell(mapped_choice, tmp_path):
 
 def test_over_one_axis_the_map_has_one_row(mapped_choice, tmp_path):
     line_choice = choose_observer(listed_axis("encoders.noise", 1e-6, 1e-5, 1e-4))
-    panels = [draw_choice(choice)[0].panels[0] for choice in (line_choice, mapped_choice)]
+    panels = [next(draw_choice(choice)).panels[0] for choice in (line_choice, mapped_choice)]
     one, both = (parts_of(panel, Map)[0].values for panel in panels)
     assert one.shape == (1, 3)
     # the same points are in the map
     np.testing.assert_array_equal(one[0], both[:, 0])
-    save(draw_choice(line_choice)[0], tmp_path / "map.png")
+    save(next(draw_choice(line_choice)), tmp_path / "map.png")
 
 
 def test_points_won_are_counted(mapped_choice):

@@ -42,4 +42,4 @@ def test_why_there_is_no_majorant_is_said(changes, sentence):
 
 def test_an_error_that_noise_tangles_has_no_figure():
     trial = run(small_study({"encoders.noise": 1e-2, "observer.motor.velocity_error": 0.0, "run.duration": 1.0}))
-    assert error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"]) == []
+    assert not [*error_plane(trial.trace, "motor", trial.summary["conditions"]["motor"])]

@@ -6,7 +6,7 @@ from panel_parts import names_of, part_named, parts_of
 
 from jaxbl.observer.conditions import CONDITIONS, judge_gains
 from jaxbl.report.drawing import draw_canvas
-from jaxbl.report.gain_plane import condition_curves, conditions_line, draw_gain_plane
+from jaxbl.report.gain_plane import condition_curves, describe_conditions, draw_gain_plane
 from jaxbl.report.panels import Band
 
 GAINS = {
@@ -24,7 +24,7 @@ GAINS = {
 def test_plane_and_sentence_agree_with_the_numbers(case):
     lambda_, alpha, bound, text = GAINS[case]
     result = judge_gains(lambda_, alpha, bound)
-    line = conditions_line("motor", result, "of a test")
+    (line,) = describe_conditions({"motor": result}, "of a test")
     assert line.startswith(f"motor: f⁺ = {bound:g} rad/s² is of a test; ")
     assert text in line
     drawing = draw_gain_plane("motor", result)
@@ -60,14 +60,14 @@ def test_curves_are_those_of_the_conditions_and_carry_their_names(alpha_is_x):
 
 def test_undisturbed_the_exact_condition_alone_asks_for_no_more_than_a_lambda():
     result = judge_gains(0.1, 1.0, 0.0)
-    line = conditions_line("motor", result, "of a test")
+    (line,) = describe_conditions({"motor": result}, "of a test")
     assert line.endswith("nothing disturbs the observer, and any λ > 0 is enough.")
     assert result["holds"]["exact"] and not result["holds"]["seeber_horn"]
 
 
 def test_factors_lead_to_where_the_exact_condition_fails():
     result = judge_gains(1.24, 2.84, 1.97)
-    line = conditions_line("motor", result, "of a test")
+    (line,) = describe_conditions({"motor": result}, "of a test")
     factor = float(line.partition(" √rad/s (")[2].partition(" ")[0])
     growth = float(line.partition(" rad/s² (")[2].partition(" ")[0])
     for share, holds in ((0.999, True), (1.001, False)):
@@ -76,4 +76,5 @@ def test_factors_lead_to_where_the_exact_condition_fails():
 
 
 def test_without_a_disturbance_no_condition_asks_for_anything():
-    assert "nothing disturbs the observer" in conditions_line("load", judge_gains(1.0, 2.0, 0.0), "of a test")
+    (line,) = describe_conditions({"load": judge_gains(1.0, 2.0, 0.0)}, "of a test")
+    assert "nothing disturbs the observer" in line

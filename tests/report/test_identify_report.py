@@ -136,7 +136,7 @@ CASES = {
 def test_all_figures_are_drawn_with_units(case, tmp_path):
     data, options, names = CASES[case]
     result = make_identification(data, tmp_path, **options)
-    drawings = draw_identification(result)
+    drawings = [*draw_identification(result)]
     assert [drawing.name for drawing in drawings] == names
     for drawing in drawings:
         assert drawing.caption.endswith(".")
@@ -195,7 +195,7 @@ def test_observers_that_diverged_leave_figures(tmp_path):
     trace = result.trace.copy()
     for name in ("motor.velocity_estimate", "motor.torque_estimate", "motor.stiffness", "motor.half_gap"):
         trace[name] = np.nan
-    drawings = draw_identification(dataclasses.replace(result, trace=trace))
+    drawings = [*draw_identification(dataclasses.replace(result, trace=trace))]
     assert [drawing.name for drawing in drawings] == GEARED
     for drawing in drawings:
         save(drawing, tmp_path / f"{drawing.name}.png")

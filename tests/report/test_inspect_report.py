@@ -33,7 +33,7 @@ CASES = {
 def test_all_figures_are_drawn_with_units(tmp_path, case):
     frame, log, names = CASES[case]
     frame.to_parquet(tmp_path / "log.parquet")
-    drawings = draw_inspection(inspect(tmp_path / "log.parquet", log))
+    drawings = [*draw_inspection(inspect(tmp_path / "log.parquet", log))]
     assert [d.name for d in drawings] == names
     for d in drawings:
         assert d.caption.endswith(".")
@@ -49,7 +49,7 @@ def test_all_figures_are_drawn_with_units(tmp_path, case):
 
 def test_a_gap_is_not_drawn_over(tmp_path):
     simulate_log().drop(index=range(1000, 1400)).to_parquet(tmp_path / "log.parquet")
-    channels = draw_inspection(inspect(tmp_path / "log.parquet"))[0]
+    channels, *_ = draw_inspection(inspect(tmp_path / "log.parquet"))
     # one break between the parts, and the one at the end
     assert [int(np.isnan(panel.parts[0].y).sum()) for panel in channels.panels] == [2, 2, 2, 2]
 
@@ -100,7 +100,7 @@ def test_the_page_in_a_browser(tmp_path):
 
 def test_a_real_log_with_two_encoders(tmp_path):
     inspection = inspect(find_recording("servoproject_dual_encoder/outputEncoderData.txt"), SERVO, gear_ratio=1.0)
-    twist = draw_inspection(inspection)[-1]
+    *_, twist = draw_inspection(inspection)
     assert twist.name == "twist" and len(twist.panels) == 1
     assert names_of(*twist.panels) == ["load on its first side", "on the other"]
     figure = describe(inspection).key_figures[0]

@@ -32,7 +32,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_all_figures_are_drawn_with_units(tmp_path, case):
     data, names = CASES[case]
-    drawings = draw_trial(run(data))
+    drawings = [*draw_trial(run(data))]
     assert [d.name for d in drawings] == names
     for d in drawings:
         assert d.caption.endswith(".")

@@ -173,7 +173,7 @@ def test_text_and_figure(axes):
 
     first, second = study(*axes, function=size(lambda frame: 0.0, 0)), study(*axes, function=size(far_shift, 2))
     comparison = compare(first, second)
-    drawings = draw_comparison(comparison)
+    drawings = [*draw_comparison(comparison)]
     assert [drawing.name for drawing in drawings] == ["factors"]
     names = {field.name for field in dataclasses.fields(comparison) if not field.name.startswith("_")}
     assert set(comparison.to_dict()) == names
