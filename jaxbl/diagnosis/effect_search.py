@@ -394,8 +394,8 @@ class EffectSearch:
 
     def _exchange(self, current: FittedModel, name: str, law: EffectNumbers | None = None, *added: str) -> FittedModel:
         """Fit a model without one of its effects, or with another law in its place."""
-        others = {other: numbers for other, numbers in current.numbers.items() if other != name}
-        return self._refit(current, {**others, **(law or {})}, *added)
+        remaining = {other: numbers for other, numbers in current.numbers.items() if other != name}
+        return self._refit(current, {**remaining, **(law or {})}, *added)
 
     def _simplify(self, fitted: FittedModel) -> FittedModel:
         """Put plain laws in the place of effects that are no more than these beside the others; take out what is nothing."""

@@ -220,7 +220,7 @@ class Predictor:
         prior[:own_count], centre[:own_count] = self.prior, -self.theta
         for turn in range(2):
             eliminated = [_eliminate(np.einsum("s,scd->cd", weight, gram), states) for gram in grams]
-            total = np.sum([rest for rest, _, _ in eliminated], axis=0)
+            total = np.sum([products for products, _, _ in eliminated], axis=0)
             variance = 1.0 if turn else max(total[0, 0] / (count * sides), 1e-300)
             lost = sum(loss for _, _, loss in eliminated) / variance
             if lost > _LOST or total[0, 0] < 0.0 or np.min(np.diag(total)[1:], initial=0.0) < 0.0:

@@ -143,8 +143,12 @@ def summary_of(
         "parameters": _parameters(record, search_fit, profiles) | _derive_numbers(fitted, search_fit),
         "correlation": {"parameters": [parameter.path for parameter in search_fit.free], "matrix": correlation},
         "refused": [
-            {"direction": direction, "why": why or _explain_refusal(direction, deviation), "relative_deviation": deviation}
-            for direction, deviation, why in search_fit.refused
+            {
+                "direction": direction,
+                "why": reason or _explain_refusal(direction, deviation),
+                "relative_deviation": deviation,
+            }
+            for direction, deviation, reason in search_fit.refused
         ],
         "held": search_fit.held,
         "condition": search_fit.condition,

@@ -133,12 +133,12 @@ def interval(parameter: FreeParameter, theta: float, deviation: float) -> tuple[
 
 
 class Refusal(NamedTuple):
-    """A combination of numbers that the record does not show: relative changes by path, how uncertain it is, and why; ""
-    where that follows from the path."""
+    """A combination of numbers that the record does not show: relative changes by path, how uncertain it is, and the reason;
+    "" where that follows from the path."""
 
     direction: dict[str, float]
     deviation: float
-    why: str = ""
+    reason: str = ""
 
 
 def refusals(free: Sequence[FreeParameter], width: Spread) -> tuple[list[Refusal], float]:

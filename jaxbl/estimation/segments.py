@@ -195,9 +195,9 @@ def windows_of(segments: Sequence[Segment], experiment: Experiment, samples: int
     def cut(*pieces: Any) -> np.ndarray:
         """Cut a column that comes in a piece a segment; shape (windows, samples)."""
         wholes = (np.asarray(piece)[: len(piece) // samples * samples] for piece in pieces)
-        return np.concatenate([whole.reshape(-1, samples) for whole in wholes])
+        return np.concatenate([column.reshape(-1, samples) for column in wholes])
 
-    torque, measured, *others = jax.tree.map(cut, *columns)
-    time, start, standing, rows = jax.tree.map(lambda column: column[:, 0], others)
+    torque, measured, *by_sample = jax.tree.map(cut, *columns)
+    time, start, standing, rows = jax.tree.map(lambda column: column[:, 0], by_sample)
     finer = np.zeros((*torque.shape, len(measured)))
     return Windows(torque, measured, time, start, reading_noise(segments), standing, finer, rows)

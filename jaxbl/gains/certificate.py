@@ -126,7 +126,7 @@ def certify(
 
 
 class Question(NamedTuple):
-    """What a certificate is asked for: arguments of :func:`certify` in SI units."""
+    """Question that a certificate answers: arguments of :func:`certify` in SI units."""
 
     lambda_: float
     alpha: float
@@ -178,8 +178,8 @@ def _prove(question: Question) -> _ScaledProof:
         question
     )
     if discretisation not in DISCRETISATIONS:
-        known = ", ".join(DISCRETISATIONS)
-        raise InputError(f"discretisation: '{discretisation}' is unknown; it should be one of {known}")
+        schemes = ", ".join(DISCRETISATIONS)
+        raise InputError(f"discretisation: '{discretisation}' is unknown; it should be one of {schemes}")
     for name, value in question._asdict().items():
         if name in ("discretisation", "reaching_time") or value is None or (0.0 < value < math.inf):
             continue

@@ -92,7 +92,7 @@ class WatchTask:
 
     @property
     def period(self) -> float:
-        """Of the rows, s."""
+        """Period of the rows, s."""
         return float(self.experiment.run.sample_period)
 
     @cached_property

@@ -14,7 +14,6 @@ from .gearing import Flanks, Gearing, find_flank
 from .least_squares import fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
-    Array,
     find_motion_bandwidth,
     interpolate_spline,
     long_segments,
@@ -170,9 +169,9 @@ class _Regression(NamedTuple):
         twist_range: of the twist without the wind-up, without a hundredth at each end, rad (m).
     """
 
-    values: Array
-    errors: Array
-    motion: Sequence[Array]
+    values: np.ndarray
+    errors: np.ndarray
+    motion: Sequence[np.ndarray]
     has_both_flanks: bool
     twist_range: float
 

@@ -9,7 +9,7 @@ from jaxbl.validation import suggest_word
 
 from .files import LogFile
 from .libraries import ColumnName
-from .signal_quality import Array, find_resolution, find_runs
+from .signal_quality import find_resolution, find_runs
 from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TorqueTable
 from .time_stamps import TimeStamps
 
@@ -29,14 +29,14 @@ class RawChannel(NamedTuple):
         drift: growth of the skew, s/s.
     """
 
-    values: Array
+    values: np.ndarray
     unit: str
     skew: float
     saturated: float = 0.0
     hold: Literal["zoh", "sampled"] | None = None
     drift: float = 0.0
 
-    def undo_delay(self, stamps: Array) -> Array:
+    def undo_delay(self, stamps: np.ndarray) -> np.ndarray:
         """Return the times of readings with these stamps, s."""
         return stamps - (self.skew + self.drift * stamps)
 
@@ -100,7 +100,7 @@ def _read_numbers(
     table: ChannelTable,
     stamps: TimeStamps,
     other_column: ColumnName | None = None,
-) -> Array:
+) -> np.ndarray:
     """Read the numbers of a channel's column, or of another one, at the selected rows; words become signed numbers."""
     column = table.column_or(name) if other_column is None else other_column
     file.check_length(file.find_column(column, f"{name}.column"), stamps.file_rows)
@@ -117,7 +117,7 @@ def _read_numbers(
     return signed_words
 
 
-def decode_words(table: ChannelTable, values: Array) -> Array:
+def decode_words(table: ChannelTable, values: np.ndarray) -> np.ndarray:
     """Return the numbers of a column, of which words with a sign become signed; NaN for a value that is no such word."""
     if table.sign_bit is not None:
         limit = 2.0**table.sign_bit
@@ -131,7 +131,7 @@ def decode_words(table: ChannelTable, values: Array) -> Array:
     return np.where(is_word, np.where(values >= limit, negative, values), np.nan)
 
 
-def to_si(table: ChannelTable, values: Array) -> Array:
+def to_si(table: ChannelTable, values: np.ndarray) -> np.ndarray:
     """Convert signed and unwrapped numbers of a column to SI units by its `[log]` table: rad (m), rad/s (m/s), N m (N)."""
     factor = table.factor or 1.0
     if isinstance(table, SpeedTable):
@@ -234,7 +234,7 @@ _CLEAR_JUMP = 5.0
 """Size of a dropout or a jump, over what the samples beside it differ by: more than any smooth signal makes."""
 
 
-def _replace_dropouts(file: LogFile, name: str, values: Array, stamps: TimeStamps) -> Array:
+def _replace_dropouts(file: LogFile, name: str, values: np.ndarray, stamps: TimeStamps) -> np.ndarray:
     """Replace single samples that return to one value again and again, as of a bus that did not answer.
 
     The value is 0, or the least or largest. Two samples on each side of a dropout lie on a line that is far from it.
@@ -269,7 +269,7 @@ _MAX_TOLERANCE = 0.02
 """Uncertainty of a jump, over its size, by the motion about it: a jump of any size meets a power of two in 1 of 25 cases."""
 
 
-def _undo_counter_jumps(file: LogFile, name: str, values: Array, step: float, stamps: TimeStamps) -> Array:
+def _undo_counter_jumps(file: LogFile, name: str, values: np.ndarray, step: float, stamps: TimeStamps) -> np.ndarray:
     """Undo jumps of a position by a power of two of its steps, between which it goes on as before."""
     from scipy.ndimage import median_filter
 
@@ -298,7 +298,7 @@ def _undo_counter_jumps(file: LogFile, name: str, values: Array, step: float, st
 # wrap-around
 
 
-def _unwrap(file: LogFile, name: str, table: PositionTable, values: Array) -> Array:
+def _unwrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> np.ndarray:
     if table.wrap is None:
         return values
     if np.ptp(values) > 1.001 * table.wrap:
@@ -313,7 +313,7 @@ def _unwrap(file: LogFile, name: str, table: PositionTable, values: Array) -> Ar
     return unwrapped
 
 
-def _check_wrap(file: LogFile, name: str, table: PositionTable, values: Array, stamps: TimeStamps) -> None:
+def _check_wrap(file: LogFile, name: str, table: PositionTable, values: np.ndarray, stamps: TimeStamps) -> None:
     """Refuse values that are smooth but for a few jumps by a common period (a turn, or a counter's range)."""
     steps = np.abs(np.diff(values))
     span = np.ptp(values)
@@ -340,7 +340,7 @@ def _check_wrap(file: LogFile, name: str, table: PositionTable, values: Array, s
 # units
 
 
-def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: Array) -> None:
+def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: np.ndarray) -> None:
     """Refuse whole numbers from 0 up without any in the middle of a word's range: negative words, logged as unsigned."""
     if values.min() < 0.0 or (values != np.round(values)).any():
         return
@@ -355,7 +355,7 @@ def _check_unsigned(file: LogFile, name: str, column: ColumnName, values: Array)
             )
 
 
-def _check_unit(file: LogFile, name: str, table: PositionTable, values: Array) -> None:
+def _check_unit(file: LogFile, name: str, table: PositionTable, values: np.ndarray) -> None:
     """Refuse radians with the step of an encoder in degrees, degrees with one in radians, and counts as radians."""
     step = find_resolution(values)
     if table.factor != 1.0 or table.unit not in ("rad", "deg") or not step:

@@ -26,7 +26,7 @@ from jaxbl.quantity import Quantity
 from jaxbl.units import on_a_line
 
 from .least_squares import BlockRegression, column_rms, fit_residual, fit_with_jackknife, mean_error, rms, student_interval
-from .signal_quality import MIN_SAMPLES, Array, count_samples, find_motion_bandwidth, low_pass, slices_between
+from .signal_quality import MIN_SAMPLES, count_samples, find_motion_bandwidth, low_pass, slices_between
 
 _MAX_SAMPLES = 20_000
 """Samples that are fitted; of longer logs, means. A few hundred describe a loop of torque over displacement."""
@@ -93,7 +93,7 @@ class Element:
     numbers: dict[str, Quantity]
     open: tuple[str, ...]
     gains: dict[str, float]
-    torque: Array
+    torque: np.ndarray
     residual: float
     share: float
     reversals: int
@@ -122,8 +122,8 @@ class RigLog(NamedTuple):
         unit: of the displacement, rad or m.
     """
 
-    position: Array
-    torque: Array
+    position: np.ndarray
+    torque: np.ndarray
     segments: Sequence[slice]
     period: float
     noise: float
@@ -144,23 +144,23 @@ class _Rig:
         torque: N m (N), shape (samples,).
     """
 
-    position: Array
-    rate: Array
-    blur: Array
-    direction: Array
+    position: np.ndarray
+    rate: np.ndarray
+    blur: np.ndarray
+    direction: np.ndarray
     stretches: list[tuple[slice, bool]]
-    rows: Array
-    torque: Array
+    rows: np.ndarray
+    torque: np.ndarray
 
     @property
     def half_range(self) -> float:
         return 0.5 * float(np.ptp(self.position))
 
     @property
-    def fitted_torque(self) -> Array:
+    def fitted_torque(self) -> np.ndarray:
         return self.torque[self.rows]
 
-    def compute_torque(self, model: "Model") -> Array:
+    def compute_torque(self, model: "Model") -> np.ndarray:
         """Return the torque of a model, N m (N), shape (rows,)."""
         return self.compute_columns(model.terms, model.shapes) @ model.sizes
 
@@ -169,7 +169,7 @@ class _Rig:
         error = rms(self.fitted_torque - self.compute_torque(model))
         return error, error / float(np.std(self.fitted_torque))
 
-    def compute_columns(self, terms: Sequence[str], shapes: Mapping[str, float]) -> Array:
+    def compute_columns(self, terms: Sequence[str], shapes: Mapping[str, float]) -> np.ndarray:
         """Return the torque per unit of stiffness, offset, and sizes of terms in order; shape (rows, linear numbers)."""
         x = self.position - shapes.get("centre", 0.0)
         b = shapes.get("half_gap", 0.0)
@@ -188,7 +188,7 @@ class _Rig:
         columns = [deflection, np.ones(len(x)), *(signals[term] for term in terms if term in signals)]
         return np.stack([column[self.rows] for column in columns], axis=1)
 
-    def _drag(self, reach: float) -> Array:
+    def _drag(self, reach: float) -> np.ndarray:
         """Return where the position has dragged what follows it at a distance of at most `reach`, shape (samples,)."""
         dragged, last = np.zeros(len(self.position)), 0.0
         for part, begins in self.stretches:
@@ -200,7 +200,7 @@ class _Rig:
             last = dragged[part.stop - 1]
         return dragged
 
-    def _compute_hysteresis(self, deflection: Array, length: float) -> Array:
+    def _compute_hysteresis(self, deflection: np.ndarray, length: float) -> np.ndarray:
         """Return h of Bouc and Wen along the deflection, shape (samples,); exact on each stretch between reversals."""
         h, last = np.zeros(len(deflection)), 0.0
         for part, begins in self.stretches:
@@ -282,7 +282,7 @@ def _prepare_rig(log: RigLog) -> _Rig | None:
     return _Rig(position, rate, blur, direction, stretches, rows, torque)
 
 
-def _find_reversals(values: Array, least: float) -> list[int]:
+def _find_reversals(values: np.ndarray, least: float) -> list[int]:
     """Return the indices of the extremes at which a signal turns back by more than `least`."""
     slope = np.sign(np.diff(values))
     moving = np.flatnonzero(slope)
@@ -313,8 +313,8 @@ class Model(NamedTuple):
 
     terms: tuple[str, ...]
     shapes: dict[str, float]
-    sizes: Array
-    errors: Array
+    sizes: np.ndarray
+    errors: np.ndarray
 
 
 def _add_terms(rig: _Rig, best: Model) -> Model:
@@ -368,7 +368,7 @@ def _fit_model(rig: _Rig, terms: tuple[str, ...], near: Mapping[str, float] = Ma
     def scale_shapes(name: str, shares: tuple[float, ...]) -> list[float]:
         return [half * share + (middle if name == "centre" else 0.0) for share in shares]
 
-    def compute_residual(shapes: Array, rig: _Rig) -> Array:
+    def compute_residual(shapes: np.ndarray, rig: _Rig) -> np.ndarray:
         return fit_residual(rig.fitted_torque, rig.compute_columns(terms, dict(zip(names, shapes, strict=True))))
 
     shapes: dict[str, float] = {}

@@ -41,7 +41,6 @@ from .libraries import (
     read_mdf,
     read_tdms,
 )
-from .signal_quality import Array
 
 _READABLE_KINDS = "text (CSV and the like), Parquet, MATLAB (.mat), JSON, MDF4, TDMS, MCAP and ROS bags can be read"
 _SUFFIXES = (
@@ -146,13 +145,13 @@ class LogFile:
         check_cost(f"{self.path}: column {name!r} of {count} values", _VALUE_BYTES * count, "cut the log into parts")
         return count
 
-    def load_values(self, name: ColumnName) -> Array:
+    def load_values(self, name: ColumnName) -> np.ndarray:
         """Load a column as it is in the file, shape (rows,); InputError if it is too long or cannot be read."""
         self.count_values(name)
         with name_file_in_errors(self.path), _report_errors(f"column {name!r}"):
             return np.asarray(self.columns[name])
 
-    def load_seconds(self, column: ColumnName, unit: float, channel: str = "") -> Array:
+    def load_seconds(self, column: ColumnName, unit: float, channel: str = "") -> np.ndarray:
         """Load a column of time stamps, s, shape (rows,); dates are counted from the first one.
 
         `unit` is the unit of stamps that are numbers, s. Errors are those of :meth:`load_numbers`.
@@ -180,7 +179,7 @@ class LogFile:
         self.date = int(nanoseconds[0]) if len(stamps) else None
         return 1e-9 * (nanoseconds - nanoseconds[:1])
 
-    def load_numbers(self, column: ColumnName, channel: str = "", rows: Array | None = None) -> Array:
+    def load_numbers(self, column: ColumnName, channel: str = "", rows: np.ndarray | None = None) -> np.ndarray:
         """Load a column of finite numbers, or some `rows` of it, shape (rows,).
 
         Raises:
@@ -356,7 +355,7 @@ def _read_parquet(path: Path, _: Selection) -> Columns:
     with path.open("rb") as opened, ParquetFile(opened) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
 
-    def load_column(name: str) -> Array:
+    def load_column(name: str) -> np.ndarray:
         with path.open("rb") as opened:
             values = pd.read_parquet(opened, columns=[name])[name]
         if isinstance(values.dtype, pd.DatetimeTZDtype):
@@ -391,7 +390,7 @@ def _read_table(path: Path, lines: list[str], encoding: str, selection: Selectio
     """
     text_format, headers = detect_text_format(lines), list[int]()
 
-    def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, Array], int]:
+    def load_rows(selection: Selection) -> tuple[list[ColumnName], dict[ColumnName, np.ndarray], int]:
         """Return the names of all columns, the values of the selected ones, and the number of rows."""
         chunks: Any = pd.read_csv(
             path,
@@ -409,7 +408,7 @@ def _read_table(path: Path, lines: list[str], encoding: str, selection: Selectio
             compression=None,
             chunksize=_CHUNK_ROWS,
         )
-        pieces: dict[ColumnName, list[Array]] = {}
+        pieces: dict[ColumnName, list[np.ndarray]] = {}
         names: list[ColumnName] = []
         count = 0
         with chunks:
@@ -596,7 +595,7 @@ def _is_number_row(line: str) -> bool:
     return len(cells) > 1 and all(map(_VALUE.fullmatch, cells))
 
 
-def _name_columns(values: list[Array], names: list[str], units: list[str]) -> Columns:
+def _name_columns(values: list[np.ndarray], names: list[str], units: list[str]) -> Columns:
     """Name the columns, and interpolate those that have their own times to the times of the first one."""
     columns, times = Columns(), values[0]
     own_times = times
@@ -772,7 +771,7 @@ def _read_hdf5(path: Path, _: Selection) -> Columns:
     columns = Columns()
     referring_nodes: set[Any] = set()
 
-    def load_dataset(place: str) -> Array:
+    def load_dataset(place: str) -> np.ndarray:
         with h5py.File(path) as file:
             return np.asarray(file[place])
 

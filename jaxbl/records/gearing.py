@@ -16,7 +16,6 @@ from .resampling import Grid
 from .rigid_body import smooth_sign
 from .signal_quality import (
     MIN_SAMPLES,
-    Array,
     ChannelStatistics,
     find_bandwidth,
     interpolate_spline,
@@ -143,7 +142,7 @@ def fit_gearing(grid: Grid, *, expected: float | None = None, turn: float = math
     )
 
 
-_MotorFit = tuple[Array, Array, Array, Array]
+_MotorFit = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Results of :func:`_regress_motor`."""
 
 
@@ -236,7 +235,7 @@ def _velocity_bandwidth(grid: Grid, channel: str) -> float:
     return slow if np.std(fast) < 0.03 * np.ptp(positions) else 0.0
 
 
-def _fit_terms(target: Array, rows: Array) -> tuple[Array, Array]:
+def _fit_terms(target: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit like :func:`fit_with_jackknife`; without the velocity, in column 1, if it is proportional to the flank."""
     coefficients, errors = fit_with_jackknife(target, rows)
     if np.isfinite(coefficients).all():
@@ -246,7 +245,7 @@ def _fit_terms(target: Array, rows: Array) -> tuple[Array, Array]:
 
 
 def _fit_lost_motion(
-    grid: Grid, aligned: list[Array], cutoff: float, ratio: float, turn: float, *, is_wide: bool
+    grid: Grid, aligned: list[np.ndarray], cutoff: float, ratio: float, turn: float, *, is_wide: bool
 ) -> LostMotion | None:
     """Fit the lost motion by the direction of motion, or by changes of the sign of the load torque.
 
@@ -301,21 +300,21 @@ def _fit_lost_motion(
     return fit_lost_motion_by_load(time, twist, position, velocity, turn) or fit
 
 
-def _rms(values: Array) -> float:
+def _rms(values: np.ndarray) -> float:
     """Return the root mean square, which is never zero here, so that it can be a divisor."""
     return rms(values) + 1e-300
 
 
-def _count_phases(place: Array) -> Array:
+def _count_phases(place: np.ndarray) -> np.ndarray:
     """Return the phases, rad, of all harmonics at a phase of the first one, shape (samples, HARMONICS)."""
     return np.outer(place, np.arange(1, HARMONICS + 1))
 
 
-Flanks = Iterator[tuple[Array, Array]]
+Flanks = Iterator[tuple[np.ndarray, np.ndarray]]
 """Pairs of a column that tells the flank and whether one is surely in contact, shape (samples,) each."""
 
 
-def find_flank(target: Array, terms: Array, flanks: Flanks) -> tuple[Array, Array] | None:
+def find_flank(target: np.ndarray, terms: np.ndarray, flanks: Flanks) -> tuple[np.ndarray, np.ndarray] | None:
     """Find the flanks that explain most of a target beside other terms; None if too few samples are clear of the gap."""
     best = None
     for flank, is_clear in flanks:
@@ -350,7 +349,7 @@ def _regress_motor(grid: Grid, cutoff: float, skew: float, drift: float | None =
         motor = low_pass(grid.values["theta_e"][s], cutoff, period)
         parts.append(np.stack([motor, offset, *low_pass_motion(moved, cutoff, period)]))
 
-    def join_segments(signals: Iterable[Array]) -> Array:
+    def join_segments(signals: Iterable[np.ndarray]) -> np.ndarray:
         """Join signals of the segments, samples last, without the ends of each."""
         inner = [signal[..., trim_filter_ends(signal.shape[-1], cutoff, period)] for signal in signals]
         return np.concatenate(inner, axis=-1)

@@ -16,7 +16,7 @@ from .gearing import Gearing, twist_noise
 from .least_squares import fit_with_jackknife, rms
 from .reader import Record, read_log_table, read_record
 from .rigid_body import RigidFit, fit_rigid_drive, smooth_sign
-from .signal_quality import Array, low_pass, low_pass_motion
+from .signal_quality import low_pass, low_pass_motion
 from .table import POSITION_CHANNELS, LogTable
 
 _Answer = Literal["yes", "weak", "no"]
@@ -83,7 +83,7 @@ class Inspection:
         return f"As read: {', '.join(sizes)}. If the machine is another, see the units in [log]."
 
     @property
-    def twist(self) -> Array | None:
+    def twist(self) -> np.ndarray | None:
         """theta_e - gear_ratio theta_s about its median, rad (m), shape (samples,); None without a ratio."""
         if self.gear_ratio is None:
             return None
@@ -138,7 +138,7 @@ def inspect(
     return Inspection(record, table, ratio, reversals, identifiability, element)
 
 
-def compute_twist(record: Record, gear_ratio: float | None) -> Array:
+def compute_twist(record: Record, gear_ratio: float | None) -> np.ndarray:
     """Return the twist of a transmission, rad (m), shape (samples,); of an element on a test rig its displacement.
 
     It is the position of one side, less `gear_ratio` times that of the other side if it was recorded.
@@ -178,12 +178,12 @@ def main_side(record: Record) -> str:
     return "motor" if "motor" in record.positions else "load"
 
 
-def compute_velocity(record: Record, side: str | None = None) -> Array:
+def compute_velocity(record: Record, side: str | None = None) -> np.ndarray:
     """Differentiate the low-passed position of a side, by default the main one; rad/s (m/s), shape (samples,)."""
     return _compute_motion(record, side or main_side(record))[1]
 
 
-def _compute_motion(record: Record, side: str) -> Array:
+def _compute_motion(record: Record, side: str) -> np.ndarray:
     """Return the low-passed position of a side, its velocity and acceleration, shape (3, samples)."""
     cutoff = _choose_cutoff(record, POSITION_CHANNELS[side])
     places = [record.positions[side][segment] for segment in record.segments]
@@ -195,11 +195,11 @@ def _choose_cutoff(record: Record, channel: str) -> float:
     return 4.0 * record.statistics.channels[channel].bandwidth or math.inf
 
 
-def _is_moving(speed: Array) -> Array:
+def _is_moving(speed: np.ndarray) -> np.ndarray:
     return np.abs(speed) > 0.1 * rms(speed)
 
 
-def _count_reversals(record: Record, speed: Array) -> int:
+def _count_reversals(record: Record, speed: np.ndarray) -> int:
     moving = _is_moving(speed)
     return sum(int(np.count_nonzero(np.diff(np.sign(speed[s][moving[s]])))) for s in record.segments)
 
@@ -208,7 +208,7 @@ _INSEPARABLE = 10.0
 """Variance inflation factor from which on a term is hardly told from others: nine tenths of it are in them."""
 
 
-def _judge_rigid_drive(record: Record, speed: Array) -> _Judgements:
+def _judge_rigid_drive(record: Record, speed: np.ndarray) -> _Judgements:
     names = ("inertia", "viscous friction", "Coulomb friction", "constant torque")
     torque, gearing = record.torque, record.statistics.gearing
     if torque is None:
@@ -248,7 +248,7 @@ _ONE_WAY, _ONE_DIRECTION = 0.05, "motion in one direction only: hard to separate
 """Share of the motion in the less frequent direction that is too little, and what is said then."""
 
 
-def _minor_share(speed: Array) -> float:
+def _minor_share(speed: np.ndarray) -> float:
     moving = speed[_is_moving(speed)]
     return float(min((moving > 0).mean(), (moving < 0).mean()))
 

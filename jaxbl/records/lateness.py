@@ -13,7 +13,6 @@ from .least_squares import column_rms, fit_residual, fit_with_jackknife, rms
 from .resampling import Grid
 from .signal_quality import (
     MIN_SAMPLES,
-    Array,
     find_motion_bandwidth,
     interpolate_spline,
     long_segments,
@@ -133,7 +132,7 @@ def _fit_lateness(
     return lateness + 0.5 * period, error, rms(accelerating_torque) / rms(target)
 
 
-def _differentiate(values: Array, period: float) -> Array:
+def _differentiate(values: np.ndarray, period: float) -> np.ndarray:
     """Differentiate by central differences of fourth order, of second order at the ends."""
     slope = np.gradient(values, period, axis=0)
     slope[2:-2] = (8.0 * (values[3:-1] - values[1:-3]) - (values[4:] - values[:-4])) / (12.0 * period)

@@ -19,8 +19,6 @@ import pandas as pd
 
 from jaxbl.errors import InputError
 
-from .signal_quality import Array
-
 ColumnName = str | int
 """Name of a column, or its number, counted from 0."""
 Selection = Collection[ColumnName]
@@ -62,11 +60,11 @@ class Column:
     def __len__(self) -> int:
         return self.rows
 
-    def __array__(self, dtype: Any = None, copy: Any = None) -> Array:
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         return np.asarray(self.load(), dtype=dtype)
 
 
-def read_at(times: Array, own_times: Array, values: Any) -> Array:
+def read_at(times: np.ndarray, own_times: np.ndarray, values: Any) -> np.ndarray:
     """Return values at the times of a log, interpolated from times of their own; NaN, no value, outside of these."""
     if np.array_equal(own_times, times, equal_nan=True):
         return np.asarray(values)
@@ -88,7 +86,7 @@ def read_tdms(path: Path, _: Selection) -> Columns:
     channels = [channel for group in library.TdmsFile.read_metadata(path).groups() for channel in group.channels()]
     names = [channel.name for channel in channels]
 
-    def load_channel(group: str, name: str) -> Array:
+    def load_channel(group: str, name: str) -> np.ndarray:
         with library.TdmsFile.open(path) as file:
             return file[group][name][:]
 
@@ -114,7 +112,7 @@ def read_mdf(path: Path, _: Selection) -> Columns:
     longest = max(groups, key=lambda i: file.groups[i].channel_group.cycles_nr)
     times = np.asarray(file.get_master(longest))
 
-    def load_channel(name: str, group: int, index: int) -> Array:
+    def load_channel(name: str, group: int, index: int) -> np.ndarray:
         signal = file.get(name, group=group, index=index)
         return read_at(times, signal.timestamps, signal.samples)
 
@@ -217,8 +215,8 @@ def _recording_columns(
 
     `counts` are the numbers of messages by topic; `iterate_messages` yields the messages of a topic.
     """
-    loaded_values: dict[ColumnName, Array] = {}
-    times: dict[str, Array] = {}
+    loaded_values: dict[ColumnName, np.ndarray] = {}
+    times: dict[str, np.ndarray] = {}
 
     def load_topic(topic: str, names: list[ColumnName]) -> dict[str, None]:
         """Load the times and some columns of a topic; return the names of all its columns."""
@@ -251,12 +249,12 @@ def _recording_columns(
         raise InputError("holds no messages with numbers; a log needs them")
     main = max(selected_topics or places.values(), key=lambda topic: counts[topic])
 
-    def load_seconds(topic: str) -> Array:
+    def load_seconds(topic: str) -> np.ndarray:
         for needed_topic in {main, topic} - {*times}:
             load_topic(needed_topic, [])
         return 1e-9 * (times[topic] - times[main][0])
 
-    def load_column(topic: str, name: str) -> Array:
+    def load_column(topic: str, name: str) -> np.ndarray:
         if name not in loaded_values:
             load_topic(topic, [name])
         values = loaded_values[name]

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .signal_quality import Array
 
-
-def filter_forwards(values: Array, numerator: Sequence[float], denominator: Sequence[float]) -> Array:
+def filter_forwards(values: np.ndarray, numerator: Sequence[float], denominator: Sequence[float]) -> np.ndarray:
     """Filter by y_k = b_0 x_k + b_1 x_{k-1} + ... - a_1 y_{k-1} - ..., as if the first value had always been there.
 
     Args:
@@ -23,7 +21,7 @@ def filter_forwards(values: Array, numerator: Sequence[float], denominator: Sequ
     return lfilter(numerator, [1.0, *denominator], values - values[0], axis=0) + values[0]
 
 
-def savitzky_golay_slopes(values: Array, half_width: int) -> Array:
+def savitzky_golay_slopes(values: np.ndarray, half_width: int) -> np.ndarray:
     """Return the slope a sample of the cubic fitted to `half_width` samples on each side, shape (samples,).
 
     The slopes within `half_width` samples of an end are wrong.

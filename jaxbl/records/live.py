@@ -24,11 +24,10 @@ from jaxbl.validation import LARGEST, open_regular_file
 from .channels import decode_words, to_si
 from .files import MAX_LINE_BYTES, LogFile, TextFormat, detect_text_format, has_cells, name_file_in_errors
 from .libraries import ColumnName, Columns
-from .signal_quality import Array
 from .table import POSITION_CHANNELS, ChannelTable, LogTable, PositionTable, SpeedTable, TimeTable, TorqueTable
 from .time_stamps import GAP_PERIODS, SECONDS_PER_UNIT
 
-Block = tuple[Sequence[ColumnName], Array]
+Block = tuple[Sequence[ColumnName], np.ndarray]
 """Names of columns, and numbers, shape (rows, columns)."""
 MALFORMED, UNREADABLE, DISORDERED = "malformed datagrams or lines", "rows without a number", "rows late or repeated"
 TOO_FAST = "datagrams that came faster than they could be taken in"
@@ -71,8 +70,8 @@ class Rows(NamedTuple):
     """
 
     time: float
-    torque: Array
-    positions: dict[str, Array]
+    torque: np.ndarray
+    positions: dict[str, np.ndarray]
     starts_segment: bool
 
 
@@ -170,7 +169,7 @@ class Stream:
         self._columns = columns
         return True
 
-    def _decode(self, values: Array) -> Array:
+    def _decode(self, values: np.ndarray) -> np.ndarray:
         """Return stamps (s), torque, motor and load as they were sent, shape (4, samples), of rows that can be read."""
         # the same as pandas' comparison of a column with a number, true or false
         for column, required in (self._table.where or {}).items():
@@ -194,7 +193,7 @@ class Stream:
         self._count(UNREADABLE, len(values) - samples.shape[1])
         return samples
 
-    def _convert(self, before: Array, samples: Array) -> Array:
+    def _convert(self, before: np.ndarray, samples: np.ndarray) -> np.ndarray:
         """Convert decoded samples, shape (4, samples), to SI units, with the turns that they belong to.
 
         `before` is the sample before them, if there is one, shape (4, 0 or 1).
@@ -203,14 +202,14 @@ class Stream:
 
         if not samples.shape[1]:
             return samples
-        numbers, known, signals = np.concatenate([before, samples], axis=1), before.shape[1], [samples[0]]
+        numbers, earlier, signals = np.concatenate([before, samples], axis=1), before.shape[1], [samples[0]]
         for i, (table, values) in enumerate(zip(self._signals.values(), numbers[1:], strict=True)):
             if isinstance(table, SpeedTable):
                 # over a gap, too, as if the speed had changed linearly
                 values = cumulative_trapezoid(to_si(table, values), numbers[0], initial=0.0)
             elif wrap := getattr(table, "wrap", None):
                 values = np.unwrap(values, period=wrap)
-            values = (values + (self._ends[i] - values[0] if known else 0.0))[known:]
+            values = (values + (self._ends[i] - values[0] if earlier else 0.0))[earlier:]
             self._ends[i] = values[-1]
             signals.append(values if isinstance(table, SpeedTable) else to_si(table, values))
         return np.stack(signals)
@@ -219,7 +218,7 @@ class Stream:
         if number:
             self.counts[fault] += int(number)
 
-    def _leave_out_outliers(self, samples: Array) -> Array:
+    def _leave_out_outliers(self, samples: np.ndarray) -> np.ndarray:
         """Leave out single rows far from both neighbours, which would move the observers or the clock for long.
 
         A row at the end that is far from the one before is held until the next one has come.
@@ -251,7 +250,7 @@ class Stream:
         self._recent = np.concatenate([self._recent, new], axis=1)[:, -_RECENT_ROWS:]
         return new
 
-    def _check_period(self, stamps: Array) -> None:
+    def _check_period(self, stamps: np.ndarray) -> None:
         """Compare the period of the first rows with the expected one."""
         if len(self._first_stamps) >= _PERIOD_ROWS:
             return
@@ -273,7 +272,7 @@ class Stream:
             self.source.fault = f"; {fault}"
         self._is_period_right = fault is None
 
-    def _split_rows(self, samples: Array) -> list[Rows]:
+    def _split_rows(self, samples: np.ndarray) -> list[Rows]:
         """Leave out rows that are late or repeated, and split the others at gaps and at restarts of the clock."""
         stamps = samples[0]
         if self._is_period_right is False and len(self._first_stamps) >= _PERIOD_ROWS:
@@ -302,7 +301,7 @@ class Stream:
             returned = 0
         return rows
 
-    def _interpolate_lost(self, samples: Array, returned: int) -> Rows:
+    def _interpolate_lost(self, samples: np.ndarray, returned: int) -> Rows:
         """Return rows without a gap, with lost samples interpolated; stamps may jitter by less than half a period.
 
         The first of the samples was `returned` already (1), or a segment starts with it (0).

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from .least_squares import BLOCKS, fit_with_jackknife, jackknife_variance, rms, student_interval
-from .signal_quality import MIN_SAMPLES, Array
+from .signal_quality import MIN_SAMPLES
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class LostMotion:
 
 
 def fit_lost_motion_by_direction(
-    twist: Array, rows: Array, flank: Array, is_clear: Array, *, other_error: float = 0.0
+    twist: np.ndarray, rows: np.ndarray, flank: np.ndarray, is_clear: np.ndarray, *, other_error: float = 0.0
 ) -> LostMotion | None:
     """Fit the twist theta_e - ratio theta_s on both flanks, at samples where one of them is surely in contact.
 
@@ -96,17 +96,19 @@ class _Cells:
     `group` numbers the pairs of place and direction: twice the place, and 1 more forwards.
     """
 
-    twist: Array
-    time: Array
-    pass_number: Array
-    group: Array
+    twist: np.ndarray
+    time: np.ndarray
+    pass_number: np.ndarray
+    group: np.ndarray
 
-    def subtract_group_means(self, values: Array) -> Array:
+    def subtract_group_means(self, values: np.ndarray) -> np.ndarray:
         """Subtract from the values of the cells their means over the same place and direction."""
         return values - (np.bincount(self.group, values) / np.maximum(np.bincount(self.group), 1))[self.group]
 
 
-def _average_passes(times: Array, twist: Array, position: Array, velocity: Array, turn: float) -> _Cells | None:
+def _average_passes(
+    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float
+) -> _Cells | None:
     span = np.ptp(position)
     moving = np.abs(velocity) > 0.25 * rms(velocity)
     if span == 0.0 or moving.sum() < MIN_SAMPLES:
@@ -128,7 +130,9 @@ def _average_passes(times: Array, twist: Array, position: Array, velocity: Array
     return _Cells(mean[order], when[order], pass_number[first], (2 * place + forwards)[first])
 
 
-def _shift_between_states(cells: _Cells, is_late: Array, selection: Array | slice = slice(None)) -> tuple[float, Array]:
+def _shift_between_states(
+    cells: _Cells, is_late: np.ndarray, selection: np.ndarray | slice = slice(None)
+) -> tuple[float, np.ndarray]:
     """Return the biweight location of the shifts at places that were crossed in both states, and these shifts.
 
     Where the load hardly pulls, the gap is not crossed in full: the shifts of such places are smaller, and count less.
@@ -154,7 +158,7 @@ def _shift_between_states(cells: _Cells, is_late: Array, selection: Array | slic
     return location, shifts
 
 
-def _find_states(cells: _Cells) -> Array | None:
+def _find_states(cells: _Cells) -> np.ndarray | None:
     """Assign one of two states to each cell, with the least residuals and few changes; None if no shift is between them."""
     count = len(cells.twist)
     centred_twist = cells.subtract_group_means(cells.twist)
@@ -185,7 +189,7 @@ def _find_states(cells: _Cells) -> Array | None:
     return None if best is None else best[1]
 
 
-def _find_best_levels(values: Array, shift: float, variance: float) -> Array:
+def _find_best_levels(values: np.ndarray, shift: float, variance: float) -> np.ndarray:
     """Find the sequence of levels 0 and `shift` that fits best (Viterbi); each change costs 20 log-likelihoods."""
     change_cost = 40.0 * max(variance, 1e-12 * shift**2)
     cost = np.stack([values**2, (values - shift) ** 2], axis=1)
@@ -201,7 +205,9 @@ def _find_best_levels(values: Array, shift: float, variance: float) -> Array:
     return np.array(levels[::-1], dtype=bool)
 
 
-def fit_lost_motion_by_load(times: Array, twist: Array, position: Array, velocity: Array, turn: float) -> LostMotion | None:
+def fit_lost_motion_by_load(
+    times: np.ndarray, twist: np.ndarray, position: np.ndarray, velocity: np.ndarray, turn: float
+) -> LostMotion | None:
     """Fit the change between passes over the same places in the same direction; None if there is no clear one.
 
     Position and velocity are the load's. Gear and encoders repeat after a `turn` of it; infinite on a linear axis.
@@ -233,7 +239,7 @@ def fit_lost_motion_by_load(times: Array, twist: Array, position: Array, velocit
     return LostMotion(size, error, interval, "load", len(change_times), change_times, (least, largest), residual)
 
 
-def _explains_more_than_drift(cells: _Cells, residuals: Array) -> bool:
+def _explains_more_than_drift(cells: _Cells, residuals: np.ndarray) -> bool:
     """Return True if the residuals of two states are much smaller than those of a steady drift over time."""
     twist, time = cells.subtract_group_means(cells.twist), cells.subtract_group_means(cells.time)
     slope = time @ twist / max(time @ time, 1e-300)

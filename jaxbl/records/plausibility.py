@@ -15,12 +15,12 @@ from .gearing import UNRELATED, Gearing, twist_noise
 from .least_squares import rms
 from .resampling import Grid
 from .rigid_body import RigidFit
-from .signal_quality import Array, ChannelStatistics, find_resolution, find_runs
+from .signal_quality import ChannelStatistics, find_resolution, find_runs
 from .table import POSITION_CHANNELS, LogTable
 from .time_stamps import SegmentedStamps, fit_even_stamps
 
 
-def check_position_moves(file: LogFile, name: str, values: Array) -> None:
+def check_position_moves(file: LogFile, name: str, values: np.ndarray) -> None:
     """Refuse a position that moves by at most three steps of its resolution."""
     step = find_resolution(values)
     if step and np.ptp(values) < 3.5 * step:
@@ -59,7 +59,7 @@ def note_standstill(file: LogFile, segmented: SegmentedStamps, channels: Mapping
                 break
 
 
-def _find_standstills(values: Array, segments: Sequence[slice]) -> Iterator[slice]:
+def _find_standstills(values: np.ndarray, segments: Sequence[slice]) -> Iterator[slice]:
     """Yield the rows of segments in which the values are equal for at least `_STANDSTILL_SAMPLES`."""
     for segment in segments:
         for start, stop in zip(*find_runs(np.diff(values[segment]) == 0.0), strict=True):
@@ -204,7 +204,7 @@ _MAX_RETURNED_WORK = -0.5
 """Share of the exchanged work, below which more comes back than any model of a drive can return."""
 
 
-def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: Array) -> None:
+def check_torque_sign(file: LogFile, rigid_fit: RigidFit, grid: Grid, position: np.ndarray) -> None:
     """Refuse a torque of the wrong sign, or remark on a doubtful one.
 
     A passive drive takes energy from its input, and its inertia is positive. `position` is that of the encoder which the
@@ -339,7 +339,7 @@ _CLEAR_STAMP_FAULT = 5.0
 """Factor by which even samples have to be smoother than their stamps make them: resampling changes noise by at most two."""
 
 
-def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: Array, resampled: Array) -> None:
+def note_host_stamps(file: LogFile, segmented: SegmentedStamps, readings: np.ndarray, resampled: np.ndarray) -> None:
     """Warn of stamps that make a motion rougher than even samples do: a host's, with the delays of its bus and system."""
     even_noise, stamped_noise = (rms(np.diff(values, n=4)) for values in (readings[segmented.segments[0]], resampled))
     if stamped_noise > _CLEAR_STAMP_FAULT * even_noise:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .least_squares import BLOCKS, column_rms, fit_residual, fit_with_jackknife, jackknife_variance, mean_error, rms
 from .rigid_body import MIN_SPEED_SHARE, smooth_sign
-from .signal_quality import Array, long_segments, low_pass, low_pass_motion, trim_filter_ends
+from .signal_quality import long_segments, low_pass, low_pass_motion, trim_filter_ends
 
 _MAX_HARMONIC = 40
 """Largest number of periods a turn: more than poles, slots and balls of small drives make."""
@@ -41,9 +41,9 @@ class TurningLog(NamedTuple):
         period: of the samples, s.
     """
 
-    torque: Array
-    motor: Array
-    load: Array | None
+    torque: np.ndarray
+    motor: np.ndarray
+    load: np.ndarray | None
     segments: Sequence[slice]
     period: float
 
@@ -70,8 +70,8 @@ class _MovingRows(NamedTuple):
         waves: exp(i n position), n = 1, 2, ..., shape (rows, waves).
     """
 
-    signals: Array
-    waves: Array
+    signals: np.ndarray
+    waves: np.ndarray
 
 
 def find_zero_shift(first: TurningLog, second: TurningLog) -> ZeroShift | None:
@@ -140,14 +140,14 @@ def _find_shift(first_rows: _MovingRows, rows: _MovingRows, lowest_wave: int) ->
     return ZeroShift(float(value), error, tuple(sorted(harmonics.tolist())))
 
 
-def _find_basis(waves: Array) -> Array:
+def _find_basis(waves: np.ndarray) -> np.ndarray:
     """Return orthonormal columns that span a constant and some waves, as far as numbers tell these apart."""
     from scipy.linalg import orth
 
     return orth(np.column_stack([np.ones(len(waves)), np.real(waves), np.imag(waves)]), rcond=1e-6)
 
 
-def _find_waves(rows: _MovingRows, motion: Array, lowest: int) -> tuple[list[int], Array]:
+def _find_waves(rows: _MovingRows, motion: np.ndarray, lowest: int) -> tuple[list[int], np.ndarray]:
     """Find the waves that a log surely shows, the one that takes away most first, and fit them beside the motion.
 
     All at once would not do: over a few turns neighbouring waves look alike.
@@ -201,7 +201,7 @@ def _select_moving_rows(log: TurningLog, cutoff: float) -> _MovingRows | None:
     return _MovingRows(signals, waves)
 
 
-def _parabola_minimum(squares: Array) -> float:
+def _parabola_minimum(squares: np.ndarray) -> float:
     """Return the index at which squares are least, interpolated by a parabola."""
     best = int(np.clip(np.argmin(squares), 1, len(squares) - 2))
     before, middle, after = squares[best - 1 : best + 2]
@@ -209,7 +209,7 @@ def _parabola_minimum(squares: Array) -> float:
     return best + (float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0)
 
 
-def _error_reduction(squares: Array, reduced: Array) -> float:
+def _error_reduction(squares: np.ndarray, reduced: np.ndarray) -> float:
     """Return by how many standard errors squares fall from `squares` to `reduced`, which are sums over blocks."""
     gains = squares - reduced
     # a difference by rounding is none

@@ -16,7 +16,6 @@ from .channels import POSITION_FACTORS, SPEED_FACTORS
 from .files import LogFile, read_log_file
 from .inspection import Inspection, compute_twist, fit_twist, inspect
 from .libraries import ColumnName
-from .signal_quality import Array
 from .table import POSITION_CHANNELS
 from .time_stamps import SECONDS_PER_UNIT
 from .unnamed_columns import find_latest, find_moving_columns, find_stamps, rises_evenly
@@ -66,7 +65,7 @@ class _Candidate(NamedTuple):
     column: ColumnName
     name: str
     unit: str
-    values: Array
+    values: np.ndarray
 
 
 def _split_unit(file: LogFile, column: ColumnName) -> tuple[str, str]:
@@ -236,7 +235,7 @@ def _make_table(channel: str, candidate: _Candidate, guesses: list[str]) -> _Tab
     return keys
 
 
-def _guess_time_unit(unit: str, values: Array, guesses: list[str]) -> str:
+def _guess_time_unit(unit: str, values: np.ndarray, guesses: list[str]) -> str:
     if unit in SECONDS_PER_UNIT:
         return unit
     median = np.median(np.diff(values.astype(float))) if len(values) > 1 else 0.0

@@ -33,7 +33,6 @@ from .plausibility import (
 from .resampling import Grid, resample_channels
 from .rigid_body import RigidFit, fit_rigid_drive
 from .signal_quality import (
-    Array,
     ChannelStatistics,
     count_jumps,
     find_bandwidth,
@@ -91,12 +90,12 @@ class Record:
     """
 
     path: Path
-    time: Array
+    time: np.ndarray
     sample_period: float
-    torque: Array | None
-    positions: dict[str, Array]
-    transmitted: Array | None
-    reference: Array | None
+    torque: np.ndarray | None
+    positions: dict[str, np.ndarray]
+    transmitted: np.ndarray | None
+    reference: np.ndarray | None
     closed_loop: bool | None
     start: float
     segments: tuple[slice, ...]
@@ -105,7 +104,7 @@ class Record:
     corrections: dict[str, float]
     contradiction: str
     statistics: LogStatistics
-    intervals: Array
+    intervals: np.ndarray
     logs: tuple[tuple[Path, slice], ...]
 
     def unit_of(self, path: str, unit: str) -> str:
@@ -507,7 +506,7 @@ def _require_channels(record: Record, names: Iterable[str], other: Record) -> No
         )
 
 
-def _list_channels(record: Record) -> dict[str, Array]:
+def _list_channels(record: Record) -> dict[str, np.ndarray]:
     channels = {f"{side} position": values for side, values in record.positions.items()}
     channels |= {"torque": record.torque, "transmitted torque": record.transmitted, "reference": record.reference}
     return {name: values for name, values in channels.items() if values is not None}

@@ -9,7 +9,7 @@ import numpy as np
 
 from .channels import RawChannel
 from .files import LogFile
-from .signal_quality import MIN_SAMPLES, Array, interpolate_spline, segments_before, slices_between
+from .signal_quality import MIN_SAMPLES, interpolate_spline, segments_before, slices_between
 from .time_stamps import SegmentedStamps
 
 _MAX_OVERSAMPLING = 100
@@ -26,8 +26,8 @@ class Grid(NamedTuple):
         period: s.
     """
 
-    time: Array
-    values: dict[str, Array]
+    time: np.ndarray
+    values: dict[str, np.ndarray]
     segments: Sequence[slice]
     period: float
 
@@ -88,7 +88,9 @@ def resample_channels(
     return Grid(np.concatenate(times), {name: np.concatenate(pieces) for name, pieces in values.items()}, segments, period)
 
 
-def _common_times(file: LogFile, stamps: Array, period: float, channels: Iterable[RawChannel], first: float | None) -> Array:
+def _common_times(
+    file: LogFile, stamps: np.ndarray, period: float, channels: Iterable[RawChannel], first: float | None
+) -> np.ndarray:
     """Return evenly spaced times at which all channels have values, s; on the grid from `first`, unless it is None."""
     begins, ends = np.transpose([raw.undo_delay(stamps[[0, -1]]) for raw in channels])
     begin, end = begins.max(), ends.min()
@@ -103,7 +105,9 @@ def _common_times(file: LogFile, stamps: Array, period: float, channels: Iterabl
     return begin + period * np.arange(count, dtype=float)
 
 
-def _hold_over_periods(stamps: Array, values: Array, grid: Array, period: float, hold: Literal["zoh", "sampled"]) -> Array:
+def _hold_over_periods(
+    stamps: np.ndarray, values: np.ndarray, grid: np.ndarray, period: float, hold: Literal["zoh", "sampled"]
+) -> np.ndarray:
     """Return torques to be held over each period of a grid, which move a drive as torques do that `hold` from `stamps` on.
 
     The last value holds for one more period. Means keep the impulse, and so the velocity that a torque makes.

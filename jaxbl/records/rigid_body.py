@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .least_squares import column_rms, fit_with_jackknife, rms
-from .signal_quality import Array, find_motion_bandwidth, long_segments, low_pass, low_pass_motion, trim_filter_ends
+from .signal_quality import find_motion_bandwidth, long_segments, low_pass, low_pass_motion, trim_filter_ends
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class RigidFit:
     """
 
     names = "inertia", "viscous", "coulomb", "spring", "constant"
-    values: Array
-    errors: Array
-    inflation: Array
-    shares: Array
+    values: np.ndarray
+    errors: np.ndarray
+    inflation: np.ndarray
+    shares: np.ndarray
     residual: float
     torque: float
     acceleration: float
@@ -54,14 +54,14 @@ MIN_SPEED_SHARE = 0.05
 """Share of the rms speed below which a drive may stick: its torque then does not depend on its motion."""
 
 
-def smooth_sign(velocity: Array) -> Array:
+def smooth_sign(velocity: np.ndarray) -> np.ndarray:
     """Return the sign of a velocity, +1 or -1, smooth through zero; shape (samples,)."""
     # 2 % of the rms velocity: standstill then counts as neither direction
     return velocity / np.hypot(velocity, 0.02 * rms(velocity) + 1e-300)
 
 
 def fit_rigid_drive(
-    torque: Array, position: Array, segments: Sequence[slice], period: float, beside: Array | None = None
+    torque: np.ndarray, position: np.ndarray, segments: Sequence[slice], period: float, beside: np.ndarray | None = None
 ) -> RigidFit | None:
     """Regress a torque, held from each stamp to the next, on the motion of an encoder; None if that is too small.
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-Array = np.ndarray
-"""Samples of a signal, or rows of several signals; each docstring gives the shape."""
 MIN_SAMPLES = 64
 """Samples that a log needs, and a segment that is filtered and regressed: ten for each of six terms of a regression.
 
@@ -46,7 +44,7 @@ class ChannelStatistics:
     skew_error: float | None = None
 
 
-def find_resolution(values: Array) -> float:
+def find_resolution(values: np.ndarray) -> float:
     """Return the step of which all differences between values are multiples; 0 if there is none."""
     span = np.ptp(values) if len(values) else 0.0
     steps = np.diff(np.unique(values))
@@ -63,7 +61,7 @@ def find_resolution(values: Array) -> float:
     return step if np.mean(remainder[steps < 1000.0 * step] < 0.1) > 0.97 else 0.0
 
 
-def power_spectrum(values: Array, period: float) -> tuple[Array, Array]:
+def power_spectrum(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the one-sided power spectral density of evenly spaced values, by Welch's method.
 
     Args:
@@ -83,12 +81,12 @@ def power_spectrum(values: Array, period: float) -> tuple[Array, Array]:
     return frequency / period, density * period / (4.0 * np.sin(np.pi * frequency) ** 2)
 
 
-def noise_floor(frequency: Array, density: Array) -> float:
+def noise_floor(frequency: np.ndarray, density: np.ndarray) -> float:
     """Return the median density above a third of the sampling rate, unit²/Hz, of a :func:`power_spectrum`."""
     return float(np.median(density[frequency >= 2.0 / 3.0 * frequency[-1]]))
 
 
-def estimate_white_noise(parts: Sequence[Array]) -> float:
+def estimate_white_noise(parts: Sequence[np.ndarray]) -> float:
     """Estimate the standard deviation of white noise on a signal, which may be in several parts.
 
     Fourth differences remove the smooth part of the signal; their median ignores jumps, which are few.
@@ -97,7 +95,7 @@ def estimate_white_noise(parts: Sequence[Array]) -> float:
     return float(np.median(np.abs(fourth)) / 0.6745 / np.sqrt(70.0))
 
 
-def find_bandwidth(values: Array, period: float, *, differentiate: bool) -> float:
+def find_bandwidth(values: np.ndarray, period: float, *, differentiate: bool) -> float:
     """Return the frequency, Hz, below which 95 % of the power above the noise lies; 0 if there is none.
 
     The power is that of the values, or of their slope (`differentiate`).
@@ -114,18 +112,18 @@ def find_bandwidth(values: Array, period: float, *, differentiate: bool) -> floa
     return float(frequency[np.searchsorted(cumulative, 0.95 * cumulative[-1])])
 
 
-def find_motion_bandwidth(position: Array, segments: Sequence[slice], period: float) -> float:
+def find_motion_bandwidth(position: np.ndarray, segments: Sequence[slice], period: float) -> float:
     """Return the bandwidth of the velocity, Hz, in the longest segment; 0 if the motion does not exceed the noise."""
     return find_bandwidth(position[longest_segment(segments)], period, differentiate=True)
 
 
-def find_runs(condition: Array) -> tuple[Array, Array]:
+def find_runs(condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return first row, and row behind the last one, of each run of rows that meet a condition, shape (runs,)."""
     edges = np.flatnonzero(np.diff(condition, prepend=False, append=False))
     return edges[::2], edges[1::2]
 
 
-def saturated_share(values: Array, step: float) -> float:
+def saturated_share(values: np.ndarray, step: float) -> float:
     """Return the share of samples in runs of five or more at the least or largest value (within half a `step`)."""
     saturated = 0
     for extreme in (values.min(), values.max()):
@@ -137,7 +135,7 @@ def saturated_share(values: Array, step: float) -> float:
     return saturated / len(values)
 
 
-def count_jumps(positions: Array, step: float, stamps: Array) -> int:
+def count_jumps(positions: np.ndarray, step: float, stamps: np.ndarray) -> int:
     """Count isolated outliers and steps of a position at `stamps` (s): differences far off their neighbours, and more than
     4.5 `step`."""
     from scipy.ndimage import median_filter, percentile_filter
@@ -155,7 +153,7 @@ def count_jumps(positions: Array, step: float, stamps: Array) -> int:
     return int(np.count_nonzero(np.diff(outliers, prepend=-10) > 2))
 
 
-def low_pass(values: Array, cutoff: float, period: float) -> Array:
+def low_pass(values: np.ndarray, cutoff: float, period: float) -> np.ndarray:
     """Low-pass values without delay: a second-order Butterworth filter forwards and backwards, `cutoff` in Hz.
 
     Samples run along the first axis. With a cutoff near the end of the band the values are returned unchanged.
@@ -174,14 +172,14 @@ def trim_filter_ends(samples: int, cutoff: float, period: float) -> slice:
     return slice(margin, samples - margin)
 
 
-def low_pass_motion(positions: Array, cutoff: float, period: float) -> tuple[Array, Array, Array]:
+def low_pass_motion(positions: np.ndarray, cutoff: float, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, velocity and acceleration of a low-passed position, or of several in columns."""
     smooth = low_pass(positions, cutoff, period)
     velocity = np.gradient(smooth, period, axis=0)
     return smooth, velocity, np.gradient(velocity, period, axis=0)
 
 
-def interpolate_spline(times: Array, values: Array, new_times: Array) -> Array:
+def interpolate_spline(times: np.ndarray, values: np.ndarray, new_times: np.ndarray) -> np.ndarray:
     """Interpolate values to new times by a cubic spline; beyond an end the end's value is returned."""
     from scipy.interpolate import CubicSpline
 

@@ -13,7 +13,7 @@ from jaxbl.workers import check_cost
 
 from .files import LogFile, read_log_file
 from .libraries import Column, ColumnName, read_at
-from .signal_quality import MIN_SAMPLES, Array, count_samples, find_resolution, longest_segment, slices_between
+from .signal_quality import MIN_SAMPLES, count_samples, find_resolution, longest_segment, slices_between
 from .table import LogTable, TimeTable
 
 GAP_PERIODS = 3.5
@@ -63,9 +63,9 @@ class TimeStamps(NamedTuple):
         max_interval: longest interval without a gap, s.
     """
 
-    times: Array
+    times: np.ndarray
     start: float
-    rows: Array
+    rows: np.ndarray
     file_rows: int
     median_interval: float
     max_interval: float
@@ -82,8 +82,8 @@ class SegmentedStamps(NamedTuple):
         sampling: statistics of the stamps.
     """
 
-    times: Array
-    distinct: Array
+    times: np.ndarray
+    distinct: np.ndarray
     segments: list[slice]
     period: float
     sampling: Sampling
@@ -147,7 +147,7 @@ def join_file(file: LogFile, table: LogTable, name: str) -> None:
     if not np.array_equal(stamps, other_stamps):
         file.note(f"{name} has times of its own; its columns are read at those of the log.")
 
-    def load_column(column: ColumnName) -> Array:
+    def load_column(column: ColumnName) -> np.ndarray:
         """Load a column of the other file at the stamps of the log, shape (stamps,); NaN outside of its own."""
         other.check_length(column, len(other_stamps))
         values = other.load_numbers(column)
@@ -161,7 +161,7 @@ def join_file(file: LogFile, table: LogTable, name: str) -> None:
         file.columns[f"{stem}{column}"] = Column(partial(load_column, column), len(stamps))
 
 
-def _read_stamps(file: LogFile, table: LogTable) -> Array:
+def _read_stamps(file: LogFile, table: LogTable) -> np.ndarray:
     """Read the time stamps of all rows of the file, s, shape (rows of the file,)."""
     time_table = table.t or TimeTable()
     if time_table.period is not None:
@@ -183,7 +183,7 @@ def _read_stamps(file: LogFile, table: LogTable) -> Array:
     return stamps
 
 
-def _find_full_rows(file: LogFile, table: LogTable, count: int) -> Array:
+def _find_full_rows(file: LogFile, table: LogTable, count: int) -> np.ndarray:
     """Tell which rows have a value in every channel: one that is logged less often has none in most rows."""
     is_full, needed_columns = np.ones(count, dtype=bool), table.list_columns() - {*(table.absent or ())}
     for column in file.columns:
@@ -196,7 +196,7 @@ def _find_full_rows(file: LogFile, table: LogTable, count: int) -> Array:
     return is_full
 
 
-def _select_rows(file: LogFile, table: LogTable, stamps: Array, is_full: Array) -> Array:
+def _select_rows(file: LogFile, table: LogTable, stamps: np.ndarray, is_full: np.ndarray) -> np.ndarray:
     """Return the numbers of the rows that `where`, `start` and `stop` select; `stamps` are s from the first one."""
     is_selected = is_full.copy()
     for column, required in (table.where or {}).items():
@@ -282,7 +282,7 @@ def split_at_gaps(file: LogFile, stamps: TimeStamps) -> SegmentedStamps:
     return SegmentedStamps(times, distinct, segments, period, sampling)
 
 
-def _split_at_intervals(stamps: Array, max_interval: float) -> tuple[list[slice], list[slice]]:
+def _split_at_intervals(stamps: np.ndarray, max_interval: float) -> tuple[list[slice], list[slice]]:
     """Return the pieces between longer intervals, and those of them that are long enough for a segment."""
     starts = np.flatnonzero(np.diff(stamps) > max_interval) + 1
     pieces = slices_between([0, *starts.tolist(), len(stamps)])
@@ -297,7 +297,7 @@ class StampFit(NamedTuple):
     first: float
 
 
-def fit_even_stamps(stamps: Array) -> StampFit:
+def fit_even_stamps(stamps: np.ndarray) -> StampFit:
     """Fit an even grid to increasing stamps, s, shape (samples,), by least squares."""
     index = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
     middle = stamps.mean()

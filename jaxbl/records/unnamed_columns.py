@@ -7,9 +7,8 @@ import numpy as np
 
 from .libraries import ColumnName
 from .rigid_body import fit_rigid_drive
-from .signal_quality import Array
 
-_Signals = Mapping[ColumnName, Array]
+_Signals = Mapping[ColumnName, np.ndarray]
 _SAME, _GEARED = 0.9, 0.99
 """Correlation from which on columns show one motion, before and behind a controller, or a gear."""
 _SAME_SIZE = 0.25
@@ -25,7 +24,7 @@ _ROUND = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0)
 """Digits of usual periods; degrees beside rad/s, or rad beside rpm, give others."""
 
 
-def rises_evenly(values: Array) -> bool:
+def rises_evenly(values: np.ndarray) -> bool:
     """Return True for numbers that rise from row to row by about as much, as stamps and row numbers do."""
     steps = np.diff(values) if values.dtype.kind in "iuf" else np.zeros(0)
     return len(steps) > 0 and bool((steps > 0.0).all() and np.ptp(steps) < 3.0 * np.median(steps))
@@ -54,7 +53,7 @@ def find_latest(signals: _Signals) -> ColumnName:
     return latest
 
 
-def find_moving_columns(signals: _Signals, times: Array | None = None) -> tuple[dict[str, ColumnName], float | None]:
+def find_moving_columns(signals: _Signals, times: np.ndarray | None = None) -> tuple[dict[str, ColumnName], float | None]:
     """Guess positions and torque of a drive; the position is the smoothest column, the motor's side moves further.
 
     Args:

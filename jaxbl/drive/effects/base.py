@@ -198,7 +198,7 @@ class AbstractEffect(eqx.Module):
         return ()
 
     def settled(self, torque: Number) -> Any:
-        """State after a commanded torque (N m) that has lasted; :meth:`init` unless it is overridden."""
+        """Return the state after a commanded torque (N m) that has lasted; :meth:`init` unless it is overridden."""
         return type(self).init(self)
 
     def set_in_motion(self, state: Any, velocity: Number) -> Any:

@@ -48,14 +48,14 @@ def study_source(folder: str | Path, sentences: Sequence[str] = ()) -> Source:
         with one_at_a_time:
             return to(result.config, asked)
 
-    answers = {to.__name__: partial(answer, to) for to in (simulated, nearby)}
+    answers = {"simulated": partial(answer, simulate_point), "nearby": partial(answer, simulate_nearby)}
     first = {axis.path: axis.start if axis.values is None else axis.values[0] for axis in result.config.axes}
     return Source(
         identity(result.config),
         [*sentences, *_lead(result)],
         write,
         answers,
-        partial(answer, simulated, {"values": first, "seed": 0}),
+        partial(answers["simulated"], {"values": first, "seed": 0}),
         one_at_a_time.acquire,
     )
 
@@ -164,8 +164,8 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
     Raises:
         InputError: other values than those, or such as the study may not have.
     """
-    given = asked if isinstance(asked, dict) else {}
-    values, seed = given.get("values"), given.get("seed")
+    question = asked if isinstance(asked, dict) else {}
+    values, seed = question.get("values"), question.get("seed")
     paths = {*config.axis_paths}
     if not isinstance(values, dict) or set(values) != paths:
         raise InputError(f"values: should have a value of each axis: {', '.join(sorted(paths))}")
@@ -175,7 +175,7 @@ def point_of(config: Config, asked: Any) -> tuple[Config, int]:
     return with_values(config, values).model_copy(update={"axes": [], "figures": [], "notes": []}), seed
 
 
-def simulated(config: Config, asked: Any) -> JsonObject:
+def simulate_point(config: Config, asked: Any) -> JsonObject:
     """One run of a study, for its page: metrics, traces (float32 in base64), the path of each error, the point as TOML.
     Arguments and errors as of :func:`point_of`."""
     point, seed = point_of(config, asked)
@@ -204,7 +204,7 @@ _NEARBY = 6
 """Runs that show how far apart rounding brings figures."""
 
 
-def nearby(config: Config, asked: Any) -> JsonObject:
+def simulate_nearby(config: Config, asked: Any) -> JsonObject:
     """Metrics of runs whose numbers differ from a point's in their last digits. Arguments and errors as of
     :func:`point_of`."""
     return {"metrics": run_perturbed(*point_of(config, asked), _NEARBY)}

@@ -19,7 +19,7 @@ from jaxbl.errors import InputError
 from jaxbl.report.aggregates import Groups
 from jaxbl.report.explorer.folder import Source, write_static
 from jaxbl.report.explorer.server import ExplorerServer
-from jaxbl.report.explorer.study import nearby, simulated, study_source, write_study
+from jaxbl.report.explorer.study import simulate_nearby, simulate_point, study_source, write_study
 from jaxbl.report.maps import best_gains, worst_runs
 from jaxbl.sweeps.sweep import open_study, share, sweep
 from jaxbl.sweeps.trial import run
@@ -402,7 +402,10 @@ def test_numbers_that_differ_in_the_last_digit_of_their_precision_give_nearly_th
         {"values": VALUES, "seed": 0},
     )
     name = "motor.velocity_rmse"
-    metrics, near = simulated(config, asked)["metrics"][name], [metric[name] for metric in nearby(config, asked)["metrics"]]
+    metrics, near = (
+        simulate_point(config, asked)["metrics"][name],
+        [metric[name] for metric in simulate_nearby(config, asked)["metrics"]],
+    )
     assert near == pytest.approx([metrics] * 6, rel=1e-3) and len({metrics, *near}) > 3
 
 
