@@ -118,7 +118,11 @@ class Cluster:
                     return
                 batch = list(finished.next_batch(block=False))
                 for future in batch:
-                    yield *begun.pop(future), self._result(future)
+                    if future.status == "lost":
+                        # with its worker, after it had ended: another one does it again
+                        finished.add(future)
+                    else:
+                        yield *begun.pop(future), self._result(future)
                 if not batch:
                     time.sleep(_POLL_SECONDS)
         finally:
