@@ -232,7 +232,7 @@ def compare_study(name: str, folder: Path, threads: int, steps: int, rounds: int
     return row | {"jaxbl": lane_steps / best[0], "c++": lane_steps / min(best[1:])}
 
 
-_TOLERANCE = dict.fromkeys(("stiffness_error", "dead_zone_error", "excitation"), 1e-5)
+_TOLERANCE: dict[str, float] = dict.fromkeys(("stiffness_error", "dead_zone_error", "excitation"), 1e-5)
 """Largest median deviation of a figure from the reference, relative, if that is not 1e-8: a short run determines the law's
 parameters badly."""
 _SHORT_STEPS = 400
