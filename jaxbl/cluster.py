@@ -234,6 +234,7 @@ def _start_local(scheduler: str) -> "Iterator[Client]":
 
     A scheduler runs the code that it is sent: without keys, that of whoever reaches its port.
     """
+    from dask import config
     from distributed import Client, LocalCluster, Security
 
     number = scheduler.removeprefix("local:")
@@ -249,7 +250,9 @@ def _start_local(scheduler: str) -> "Iterator[Client]":
             "--scheduler local:N: needs cryptography; install it with: pip install 'jaxbl[distributed]'"
         ) from None
     announce("starting workers")
+    # a process that was forked would share the locks of this one's compiler
     with (
+        config.set({"distributed.worker.multiprocessing-method": "spawn"}),
         LocalCluster(
             n_workers=count,
             threads_per_worker=max(count_cores() // count, 1),

@@ -23,7 +23,7 @@ from size import ROOT, Size, measure_file, measure_folders
 # and it and `drive` have friction that falls, plain laws in every model that is tried, and what laws of friction miss (paid
 # for by other parts of it). Functions named by a participle: three of `drive`, which effects of one's own may have.
 CEILINGS = {
-    "all": (366438, 0.01, 0.11, 0.0),
+    "all": (366453, 0.01, 0.11, 0.0),
     "report": (42463, 0.01, 0.0, 0.0),
     "diagnosis": (54391, 0.0, 0.0, 0.0),
     "records": (50149, 0.0, 0.0, 0.0),
@@ -32,7 +32,7 @@ CEILINGS = {
     "sweeps": (28178, 0.08, 0.0, 0.0),
     "exports": (23119, 0.02, 0.0, 0.0),
     "fused": (23274, 0.0, 0.0, 0.0),
-    ".": (22438, 0.0, 0.0, 0.0),
+    ".": (22453, 0.0, 0.0, 0.0),
     "drive": (13415, 0.0, 1.58, 0.0),
     "throughput": (7688, 0.0, 0.0, 0.0),
     "cli": (9591, 0.09, 0.0, 0.0),
